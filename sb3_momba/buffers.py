@@ -1,0 +1,202 @@
+"""A replay buffer of vector rewards and the preferences under which they were earned."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_momba.envs.preferences import preference_dim
+
+SMALLEST_CONCENTRATION = 1e-3
+
+
+class PreferenceReplayBufferSamples(NamedTuple):
+    """A minibatch. `observations` and `next_observations` carry the SAME preference (eqs. 3.3 and 3.11)."""
+
+    observations: th.Tensor  # [s, w], (batch, observation_dim + preference_dim)
+    actions: th.Tensor  # on [-1, 1], (batch, action_dim)
+    next_observations: th.Tensor  # [s', w], like observations
+    dones: th.Tensor  # 1 where the return ends (terminated, not truncated), (batch,)
+    rewards: th.Tensor  # (batch, n_objectives), summed and discounted over n steps
+    discounts: th.Tensor  # gamma^n of the n steps summed, (batch,)
+    preferences: th.Tensor  # w, (batch, n_objectives)
+
+
+class PreferenceReplayBuffer(ReplayBuffer):
+    """Transitions (s, a, r, s', terminated, w) of Algorithm 1, raw and in float32.
+
+    The wrapper's next observation carries the next preference, so s, s' and w are stored apart, and `sample` appends one
+    w to both.
+
+    :param buffer_size: transitions, over all environments
+    :param observation_space: of the wrapped environment: [s, w]
+    :param n_objectives: width of the rewards
+    :param gamma: discount of the rewards within an n-step return
+    :param n_steps: transitions that one reward sums over, cut short where an episode ends
+    :param keep_probability: p_keep of hindsight relabelling, eq. (3.20); 1 switches it off
+    :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
+    :param seed: of the buffer's own random stream
+    """
+
+    observation_space: spaces.Box
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        *,
+        n_objectives: int,
+        gamma: float = 0.99,
+        n_steps: int = 1,
+        keep_probability: float = 1.0,
+        concentration: float = 5.0,
+        seed: int | None = None,
+    ):
+        if optimize_memory_usage:
+            raise ValueError("optimize_memory_usage=True cannot tell a truncated episode's last state: leave it False.")
+        if n_steps < 1:
+            raise ValueError(f"n_steps={n_steps}: a return sums over at least 1 step.")
+        if not 0 <= keep_probability <= 1 or concentration <= 0:
+            raise ValueError(
+                f"keep_probability={keep_probability}, concentration={concentration}: the first is a probability, the "
+                "second positive."
+            )
+        self.n_objectives = n_objectives
+        self.preference_dim = preference_dim(n_objectives)
+        raw_dim = observation_space.shape[0] - self.preference_dim
+        raw_space = spaces.Box(observation_space.low[:raw_dim], observation_space.high[:raw_dim], dtype=np.float32)
+        super().__init__(buffer_size, raw_space, action_space, device, n_envs)
+        self.rewards = np.zeros((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
+        self.preferences = np.ones((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
+        self.gamma = gamma
+        self.n_steps = n_steps
+        self.keep_probability = keep_probability
+        self.concentration = concentration
+        self.rng = np.random.default_rng(seed)
+
+    @property
+    def observation_dim(self) -> int:
+        """Width of an observation without its preference."""
+        return int(self.obs_shape[0])
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one step of every environment.
+
+        :param obs: [s, w], (n_envs, observation_dim + preference_dim): this w is the one that the action saw
+        :param next_obs: [s', next w], like obs; before the reset where an episode has ended
+        :param reward: the scalar rewards, (n_envs,), used only where no PreferenceWrapper reports vectors
+        :param infos: with `vector_reward` from PreferenceWrapper
+        """
+        vector_rewards = self._vector_rewards(reward, infos)
+        raw = self.observation_dim
+        if self.preference_dim > 0:
+            self.preferences[self.pos] = obs[:, raw:]
+        super().add(obs[:, :raw], next_obs[:, :raw], action, vector_rewards, done, infos)
+
+    @property
+    def latest_rewards(self) -> np.ndarray:
+        """Of the step stored last, (n_envs, n_objectives)."""
+        return self.rewards[self.pos - 1]
+
+    def _vector_rewards(self, reward: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
+        expected = (self.n_envs, self.n_objectives)
+        if all("vector_reward" in info for info in infos):
+            vectors = [info["vector_reward"] for info in infos]
+            for index, vector in enumerate(vectors):
+                if np.shape(vector) != expected[1:]:
+                    raise ValueError(f"Environment {index}: vector_reward has shape {np.shape(vector)}, not {expected[1:]}.")
+            rewards = np.stack(vectors)
+        elif self.n_objectives == 1:
+            rewards = np.asarray(reward, dtype=np.float32)
+            if rewards.shape != (self.n_envs,):
+                raise ValueError(
+                    f"Rewards of shape {rewards.shape} where one number for each of {self.n_envs} environments is expected: "
+                    "vector rewards need sb3_momba.make_mo_vec_env."
+                )
+            rewards = rewards[:, None]
+        else:
+            index = next(i for i, info in enumerate(infos) if "vector_reward" not in info)
+            raise ValueError(
+                f"Environment {index}: info has no 'vector_reward'. A wrapper outside PreferenceWrapper drops it: put that "
+                "wrapper inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
+            )
+        if not np.isfinite(rewards).all():
+            raise ValueError(f"The rewards {rewards.tolist()} of {self.n_envs} environments are not all finite.")
+        return rewards
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> PreferenceReplayBufferSamples:  # type: ignore[override]
+        """Uniformly, with replacement, and relabelled by eq. (3.20) where hindsight is on.
+
+        :raises ValueError: if nothing is stored yet
+        """
+        upper = self.buffer_size if self.full else self.pos
+        if upper == 0:
+            raise ValueError("The replay buffer is empty: nothing to sample.")
+        return self._get_samples(self.rng.integers(upper, size=batch_size), env)
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> PreferenceReplayBufferSamples:
+        if env is not None:
+            raise ValueError("VecNormalize is not needed: the policy normalises observations, and rewards by their returns.")
+        env_inds = self.rng.integers(self.n_envs, size=len(batch_inds))
+        rewards, discounts, last_inds = self._n_step_returns(batch_inds, env_inds)
+        preferences = self._relabel(self.preferences[batch_inds, env_inds])
+        appended = preferences[:, : self.preference_dim]
+        observations = self.observations[batch_inds, env_inds]
+        next_observations = self.next_observations[last_inds, env_inds]
+        terminated = self.dones[last_inds, env_inds] * (1 - self.timeouts[last_inds, env_inds])
+        arrays = PreferenceReplayBufferSamples(
+            observations=np.concatenate([observations, appended], axis=1),  # type: ignore[arg-type]
+            actions=self.actions[batch_inds, env_inds],  # type: ignore[arg-type]
+            next_observations=np.concatenate([next_observations, appended], axis=1),  # type: ignore[arg-type]
+            dones=terminated,  # type: ignore[arg-type]
+            rewards=rewards,  # type: ignore[arg-type]
+            discounts=discounts,  # type: ignore[arg-type]
+            preferences=preferences,  # type: ignore[arg-type]
+        )
+        return PreferenceReplayBufferSamples(*(th.as_tensor(array, device=self.device) for array in arrays))
+
+    def _n_step_returns(self, batch_inds: np.ndarray, env_inds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sum of gamma^i r_{t+i} for i < n, gamma^n, and the index of the n-th transition, where n <= n_steps ends with
+        the episode or with what is stored."""
+        rewards = self.rewards[batch_inds, env_inds].copy()
+        discounts = np.full(len(batch_inds), self.gamma, dtype=np.float32)
+        last_inds = batch_inds.copy()
+        newest = (self.pos - 1) % self.buffer_size
+        for _ in range(self.n_steps - 1):
+            goes_on = (self.dones[last_inds, env_inds] == 0) & (last_inds != newest)
+            last_inds = np.where(goes_on, (last_inds + 1) % self.buffer_size, last_inds)
+            rewards += np.where(goes_on, discounts, 0)[:, None] * self.rewards[last_inds, env_inds]
+            discounts = np.where(goes_on, discounts * np.float32(self.gamma), discounts)
+        return rewards, discounts, last_inds
+
+    def _relabel(self, preferences: np.ndarray) -> np.ndarray:
+        """Eq. (3.20): w' = w with probability p_keep, else w' ~ Dirichlet(k w), drawn in float64.
+
+        :param preferences: w, (batch, n_objectives)
+        :return: w', (batch, n_objectives)
+        """
+        if self.keep_probability == 1 or self.n_objectives == 1:
+            return preferences
+        parameters = np.maximum(self.concentration * preferences.astype(np.float64), SMALLEST_CONCENTRATION)
+        relabelled = self.rng.standard_gamma(parameters)
+        # Gamma draws with tiny parameters can all underflow to 0: then the preference stays.
+        total = relabelled.sum(axis=1, keepdims=True)
+        keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None] | (total == 0)
+        return np.where(keep, preferences, relabelled / np.where(total == 0, 1, total)).astype(np.float32)

@@ -1,0 +1,1 @@
+"""What the agent acts in: preferences, the wrapper that shows them to the agent, and tasks."""

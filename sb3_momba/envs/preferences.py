@@ -1,0 +1,125 @@
+"""Preferences on the probability simplex (Definition 3): checks, samplers and grids.
+
+A sampler is any callable `rng -> (n_objectives,)`, where rng is a `numpy.random.Generator`. One with a true attribute
+`per_step` is asked for a new preference after every step instead of every episode.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from itertools import combinations
+from math import comb
+
+import numpy as np
+
+PreferenceSampler = Callable[[np.random.Generator], np.ndarray]
+
+SIMPLEX_TOLERANCE = 1e-5
+
+logger = logging.getLogger(__name__)
+
+
+def preference_dim(n_objectives: int) -> int:
+    """How many numbers of an observation are the preference: none with one objective, where there is nothing to prefer."""
+    return n_objectives if n_objectives > 1 else 0
+
+
+def check_preference(preference: Sequence[float] | np.ndarray, n_objectives: int) -> np.ndarray:
+    """A preference, or a batch of them, as float32 on the simplex; rounding errors are normalised away.
+
+    :param preference: (n_objectives,) or (batch, n_objectives), not negative, each summing to 1
+    :raises ValueError: names what is wrong with it
+    """
+    try:
+        w = np.asarray(preference, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"The preference {preference!r} is not an array of {n_objectives} numbers.") from error
+    if w.ndim not in (1, 2) or w.shape[-1] != n_objectives:
+        raise ValueError(f"The preference {preference!r} has shape {w.shape}: give {n_objectives} weights, one per objective.")
+    if not np.isfinite(w).all():
+        raise ValueError(f"The preference {preference!r} has a weight that is not finite.")
+    if (w < -SIMPLEX_TOLERANCE).any():
+        raise ValueError(f"The preference {preference!r} has a negative weight: weights are at least 0 and sum to 1.")
+    total = w.sum(axis=-1, keepdims=True)
+    if (np.abs(total - 1) > SIMPLEX_TOLERANCE).any():
+        raise ValueError(f"The preference {preference!r} sums to {total.squeeze()}, not to 1: divide it by its sum.")
+    w = w.clip(min=0.0)
+    return (w / w.sum(axis=-1, keepdims=True)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class UniformSampler:
+    """w ~ Dirichlet(1_d), uniform on the simplex (Algorithm 1)."""
+
+    n_objectives: int
+
+    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.dirichlet(np.ones(self.n_objectives))
+
+
+@dataclass(frozen=True)
+class FixedSampler:
+    """Always the same preference (section 4.2.4)."""
+
+    preference: tuple[float, ...]
+
+    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+        return np.asarray(self.preference)
+
+
+@dataclass(frozen=True)
+class PerStepSampler:
+    """Another sampler, asked for a new preference after every step, as CAPQL does."""
+
+    sampler: PreferenceSampler
+    per_step: bool = True
+
+    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+        return self.sampler(rng)
+
+
+def simplex_lattice(n_objectives: int, divisions: int) -> np.ndarray:
+    """All preferences whose weights are multiples of 1 / divisions (Das & Dennis, 1998), in lexicographic order.
+
+    :return: (C(divisions + n_objectives - 1, n_objectives - 1), n_objectives)
+    """
+    bars = combinations(range(divisions + n_objectives - 1), n_objectives - 1)
+    edges = np.array([[-1, *bar, divisions + n_objectives - 1] for bar in bars])
+    return (np.diff(edges, axis=1) - 1) / divisions
+
+
+@lru_cache
+def _riesz_grids() -> dict[str, np.ndarray]:
+    with resources.files("sb3_momba.envs").joinpath("riesz_100.npz").open("rb") as file, np.load(file) as grids:
+        return dict(grids)
+
+
+def preference_grid(n_objectives: int, n_preferences: int = 100) -> np.ndarray:
+    """Equally spaced preferences on the simplex (section 4.1.2).
+
+    Two objectives: `linspace`, exactly n. Three to six: 100 points of least Riesz energy (Blank et al., 2021), computed
+    with pymoo's `get_reference_directions("energy", d, 100, seed=1)`. Any other n: the smallest simplex lattice with at least n points, said in
+    the log.
+
+    :return: float64 (n, n_objectives)
+    """
+    if n_objectives < 1 or n_preferences < 1:
+        raise ValueError(f"n_objectives={n_objectives}, n_preferences={n_preferences}: both must be at least 1.")
+    if n_objectives == 1:
+        return np.ones((1, 1))
+    if n_objectives == 2:
+        first = np.linspace(0, 1, n_preferences) if n_preferences > 1 else np.array([0.5])
+        return np.stack([first, 1 - first], axis=1)
+    if n_preferences == 100 and str(n_objectives) in _riesz_grids():
+        return _riesz_grids()[str(n_objectives)].copy()
+    divisions = 1
+    while comb(divisions + n_objectives - 1, n_objectives - 1) < n_preferences:
+        divisions += 1
+    grid = simplex_lattice(n_objectives, divisions)
+    if len(grid) != n_preferences:
+        logger.warning(
+            "%d preferences asked for %d objectives: the nearest simplex lattice has %d.", n_preferences, n_objectives, len(grid)
+        )
+    return grid

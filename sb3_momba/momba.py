@@ -1,0 +1,482 @@
+"""MOMBA: preference-conditioned maximum-entropy actor-critic with SimbaV2 networks and distributional critics."""
+
+import logging
+import warnings
+from collections.abc import Sequence
+from typing import Any, ClassVar, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
+
+from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
+from sb3_momba.envs.preferences import PreferenceSampler, check_preference, preference_dim
+from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.nn.distributional import lowest
+from sb3_momba.nn.networks import Actor, Critic
+from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+from sb3_momba.saving import PickleFreeSaving
+
+BLIND_UPDATES = 1_000
+
+Metrics = dict[str, th.Tensor]
+Self = TypeVar("Self", bound="MOMBA")
+
+logger = logging.getLogger(__name__)
+
+
+class MOMBA(PickleFreeSaving):
+    """Multi-objective RL with expressive function approximators (Algorithm 1 of the thesis).
+
+    CAPQL (Lu et al., 2023) with SimbaV2 networks (Lee et al., 2025) and distributional critics: one run learns one policy
+    pi(a | s, w) for every preference w. With a scalar reward it is single-objective SimbaV2-SAC. Defaults are Table B.1's.
+
+    :param policy: "SimbaPolicy", "MlpPolicy" or a class
+    :param env: id, environment or VecEnv; environments are put into PreferenceWrapper
+    :param learning_rate: of actor, critics and entropy coefficient; a number or a function of the remaining progress
+    :param buffer_size: transitions kept
+    :param learning_starts: steps of uniformly random actions before the first update
+    :param batch_size: transitions per update
+    :param tau: step of the target critics towards the critics
+    :param gamma: discount
+    :param train_freq: steps between updates, or (n, "step" | "episode")
+    :param gradient_steps: updates each time; -1: as many as steps were taken
+    :param action_noise: added to the policy's actions while training
+    :param n_steps: of an n-step return
+    :param critic_loss: "ce", distributional critics (section 3.2), or "mse", expected values
+    :param vector_values: critics of the vector return (section 3.2.2) instead of the scalarised one (3.2.1)
+    :param her: relabel preferences in hindsight, eq. (3.20)
+    :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0)`
+    :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values
+    :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
+    :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
+    :param target_entropy: of the policy on [-1, 1], in nats; "auto": -|A|
+    :param preference_sampler: `rng -> (n_objectives,)` for all environments; None leaves them theirs, by default uniform
+        on the simplex once an episode
+    :param replay_buffer_class: PreferenceReplayBuffer or a subclass
+    :param policy_kwargs: see SimbaPolicy, MlpPolicy and MombaPolicy
+    :raises ValueError: for settings or environments that do not go together, naming them
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"SimbaPolicy": SimbaPolicy, "MlpPolicy": MlpPolicy}
+    policy: MombaPolicy
+    actor: Actor  # type: ignore[assignment]
+    critic: Critic
+    critic_target: Critic
+
+    def __init__(
+        self,
+        policy: str | type[MombaPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 5_000,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        n_steps: int = 1,
+        critic_loss: str = "ce",
+        vector_values: bool = False,
+        her: bool = False,
+        her_kwargs: dict[str, Any] | None = None,
+        preference_alignment: bool = False,
+        best_return_scale: float | None = 3.0,
+        ent_coef: str | float = "auto_0.2",
+        target_entropy: str | float = "auto",
+        preference_sampler: PreferenceSampler | None = None,
+        replay_buffer_class: type[PreferenceReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if isinstance(env, str):
+            env = make_env(env, {"render_mode": "rgb_array"})
+        super().__init__(
+            policy,  # type: ignore[arg-type]
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class or PreferenceReplayBuffer,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.critic_loss = critic_loss
+        self.vector_values = vector_values
+        self.her = her
+        self.her_kwargs = her_kwargs
+        self.preference_alignment = preference_alignment
+        self.best_return_scale = best_return_scale
+        self.ent_coef = ent_coef
+        self.target_entropy = target_entropy
+        self.preference_sampler = preference_sampler
+        self.log_ent_coef: th.Tensor | None = None
+        self.ent_coef_optimizer: th.optim.Optimizer | None = None
+        self.n_objectives = 1 if self.env is None else n_objectives_of(self.env)
+        self._metrics: Metrics = {}
+        self._metrics_count = 0
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------------------------------------ construction
+
+    def _setup_model(self) -> None:
+        self._check_settings()
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        if self.env is not None:
+            self._prepare_env(self.env)
+        self.replay_buffer = self._make_replay_buffer()
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            **{**self._injected_policy_kwargs(), **self.policy_kwargs},
+        ).to(self.device)
+        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
+        self._convert_train_freq()
+        self._setup_entropy_coefficient()
+        self._blind_updates = th.zeros((), device=self.device)
+        self._warned_blind = False
+
+    def _check_settings(self) -> None:
+        if self.preference_alignment and not self.vector_values:
+            raise ValueError("preference_alignment=True needs the vector Q of eq. (3.21): set vector_values=True.")
+        if self.her_kwargs is not None and not self.her:
+            raise ValueError(f"her_kwargs={self.her_kwargs} without her=True: set her=True, or leave them out.")
+        if not issubclass(self.replay_buffer_class or PreferenceReplayBuffer, PreferenceReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class={self.replay_buffer_class}: it must be PreferenceReplayBuffer or a subclass, which "
+                "stores vector rewards and preferences."
+            )
+
+    def _injected_policy_kwargs(self) -> dict[str, Any]:
+        """What the policy must know of the algorithm; the user's `policy_kwargs` stay as they were given."""
+        return {
+            "n_objectives": self.n_objectives,
+            "critic_loss": self.critic_loss,
+            "vector_values": self.vector_values,
+            "best_return_scale": self.best_return_scale,
+            "gamma": self.gamma,
+        }
+
+    def _make_replay_buffer(self) -> PreferenceReplayBuffer:
+        relabelling = {"keep_probability": 0.2, "concentration": 5.0, **(self.her_kwargs or {})} if self.her else {}
+        buffer_class: Any = self.replay_buffer_class or PreferenceReplayBuffer
+        return buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **{
+                "n_objectives": self.n_objectives,
+                "gamma": self.gamma,
+                "n_steps": self.n_steps,
+                "seed": self.seed,
+                **relabelling,
+                **self.replay_buffer_kwargs,
+            },
+        )
+
+    def _setup_entropy_coefficient(self) -> None:
+        """alpha = exp(beta), learned or fixed (section 3.4.2)."""
+        if self.target_entropy == "auto":
+            self.target_entropy = -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        self.target_entropy = float(self.target_entropy)
+        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
+            start = float(self.ent_coef.split("_")[1]) if "_" in self.ent_coef else 1.0
+            if start <= 0:
+                raise ValueError(f"ent_coef={self.ent_coef!r}: alpha must start above 0.")
+            self.log_ent_coef = th.tensor(start, device=self.device).log().requires_grad_(True)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
+        else:
+            self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """Monitor(PreferenceWrapper(env)) in a VecEnv; a VecEnv must have the wrapper already, or be scalar."""
+        if isinstance(env, gym.Env):
+            env = wrap_env(env)
+        venv = PickleFreeSaving._wrap_env(env, verbose, monitor_wrapper)
+        check_vec_env(venv)
+        for wrapper in (VecNormalize, VecFrameStack):
+            if n_objectives_of(venv) > 1 and is_vecenv_wrapped(venv, wrapper):
+                raise ValueError(
+                    f"{wrapper.__name__} changes [observation, preference] or the scalar reward only: leave it out. The policy "
+                    "normalises observations and rewards itself; stack frames inside PreferenceWrapper."
+                )
+        return venv
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        self._prepare_env(self.env)
+
+    def _prepare_env(self, env: VecEnv) -> None:
+        if n_objectives_of(env) != self.n_objectives:
+            raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(env)}.")
+        if self.preference_sampler is not None:
+            env.env_method("set_preference_sampler", self.preference_sampler)
+        if self.n_objectives == 1:
+            logger.warning("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed torch, numpy, the environments, the action space and the replay buffer."""
+        super().set_random_seed(seed)
+        if seed is not None and self.replay_buffer is not None:
+            self.replay_buffer.rng = np.random.default_rng(seed)
+
+    # ---------------------------------------------------------------------------------------------------- acting
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        *,
+        preference: Sequence[float] | np.ndarray | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """The policy's action, within the bounds of the action space.
+
+        :param observation: as the environment gives it, (observation_dim,) or (batch, observation_dim), with `preference`;
+            or [observation, w], as the wrapped environment gives it, without
+        :param preference: (n_objectives,) or (batch, n_objectives)
+        :param deterministic: the mean action instead of a sample
+        :return: (action_dim,) or (batch, action_dim), and `state`
+        :raises ValueError: if one of both is missing, doubled or of the wrong shape
+        """
+        return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
+
+    def _with_preference(
+        self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None
+    ) -> np.ndarray:
+        if isinstance(observation, tuple | dict):
+            return observation  # the policy's own error
+        observation = np.asarray(observation)
+        raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
+        width = observation.shape[-1] if observation.ndim > 0 else 0
+        if preference is None:
+            if width == raw != wrapped:
+                raise ValueError(
+                    f"This observation has no preference: predict(observation, preference=[...]) with {self.n_objectives} weights."
+                )
+            return observation
+        w = check_preference(preference, self.n_objectives)
+        if wrapped == raw:
+            return observation
+        if width != raw:
+            raise ValueError(
+                f"With preference=, the observation must be the environment's own, {raw} wide, not {width}"
+                + (", which carries a preference already." if width == wrapped else ".")
+            )
+        if observation.ndim < w.ndim or (w.ndim == 2 and len(w) != len(observation)):
+            raise ValueError(f"Observations of shape {observation.shape} and preferences of shape {w.shape} do not match.")
+        w = np.broadcast_to(w, (*observation.shape[:-1], self.n_objectives))
+        return np.concatenate([observation, w], axis=-1, dtype=np.float32)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store the transition, then update the normalisation statistics with s_t and r_t (Algorithm 1)."""
+        assert isinstance(self._last_obs, np.ndarray)
+        observations = self._last_obs[:, : self.policy.observation_dim]
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.policy.statistics.update(observations)
+        self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
+
+    # -------------------------------------------------------------------------------------------------- learning
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """The gradient steps of Algorithm 1."""
+        self.policy.set_training_mode(True)
+        optimizers = [self.critic.optimizer, self.actor.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+
+        for _ in range(gradient_steps):
+            batch = self._sample(batch_size)
+            alpha = self.alpha
+            critic_loss, critic_metrics = self._critic_loss(batch, alpha)
+            descend(self.critic.optimizer, critic_loss)
+            actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
+            descend(self.actor.optimizer, actor_loss)
+            if self.ent_coef_optimizer is not None:
+                descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
+            self.policy.project_weights()
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            self._n_updates += 1
+            self._note({**critic_metrics, **actor_metrics, "ent_coef": alpha})
+
+    def _sample(self, batch_size: int) -> PreferenceReplayBufferSamples:
+        """A minibatch, normalised with the statistics of this moment."""
+        batch = self.replay_buffer.sample(batch_size)
+        return batch._replace(
+            observations=self.policy.normalize(batch.observations),
+            next_observations=self.policy.normalize(batch.next_observations),
+            rewards=batch.rewards * self.policy.return_scale.factor,
+        )
+
+    def _critic_loss(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> tuple[th.Tensor, Metrics]:
+        """Eq. (3.17), or eqs. (3.2) and (3.13) by `critic_loss` and `vector_values`."""
+        value = self.policy.value
+        with th.no_grad():
+            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            targets = value.bootstrap(
+                self.critic_target(batch.next_observations, next_actions),
+                rewards=batch.rewards if self.vector_values else scalarise(batch.rewards, batch.preferences)[:, None],
+                discounts=batch.discounts * (1 - batch.dones),
+                bonus=-alpha * next_log_prob,
+            )
+            target = lowest(targets, self._scalarised(value.target_mean(targets), batch.preferences))
+        features = self.critic.features(batch.observations, batch.actions)
+        outputs = self.critic.values(features)
+        loss = value.loss(outputs, target).sum(dim=(1, 2)).mean()
+        with th.no_grad():
+            metrics = {
+                "critic_loss": loss.detach(),
+                "q": value.mean(outputs).mean(dim=(0, 1)),
+                "target_end_mass": value.end_mass(target).mean(),
+                "feature_norm": th.linalg.vector_norm(features, dim=-1).mean(),
+            }
+        return loss, metrics
+
+    def _actor_loss(
+        self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, Metrics]:
+        """Eq. (3.18), with eq. (3.21)'s alignment if it is on. Also returns log pi(a | s, w), (batch,)."""
+        actions, log_prob = self.actor.action_log_prob(batch.observations)
+        q_vector = self.policy.value.mean(self.critic(batch.observations, actions))
+        q = self._scalarised(q_vector, batch.preferences)
+        if self.preference_alignment:
+            q = q * th.cosine_similarity(q_vector, batch.preferences[:, None], dim=-1)
+        loss = (alpha * log_prob - q.min(dim=1).values).mean()
+        return loss, log_prob.detach(), {"actor_loss": loss.detach(), "entropy": -log_prob.detach().mean()}
+
+    def _alpha_loss(self, log_prob: th.Tensor) -> th.Tensor:
+        """Eq. (3.19) with alpha = exp(beta)."""
+        assert self.log_ent_coef is not None
+        return -(self.log_ent_coef.exp() * (log_prob + self.target_entropy)).mean()
+
+    @property
+    def alpha(self) -> th.Tensor:
+        """The entropy coefficient, a scalar without gradient."""
+        return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
+
+    def _scalarised(self, values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
+        """w.Q of eqs. (3.12) and (3.16): (batch, n_critics, n_values) -> (batch, n_critics)."""
+        return scalarise(values, preferences[:, None]) if self.vector_values else values.squeeze(-1)
+
+    # --------------------------------------------------------------------------------------------------- logging
+
+    def _note(self, metrics: Metrics) -> None:
+        """Add up metrics as tensors; `dump_logs` turns their means into numbers."""
+        for name, value in metrics.items():
+            self._metrics[name] = self._metrics[name] + value if name in self._metrics else value
+        self._metrics_count += 1
+        blind = metrics["target_end_mass"] > 0.5
+        self._blind_updates = (self._blind_updates + 1) * blind
+        if not self._warned_blind and self._n_updates % BLIND_UPDATES == 0 and self._blind_updates >= BLIND_UPDATES:
+            self._warned_blind = True
+            warnings.warn(
+                f"For {BLIND_UPDATES} updates more than half of the critics' target mass has been on an end of their support: "
+                "they cannot tell good from better. At the start this comes from a large entropy coefficient: try "
+                'ent_coef="auto_0.01", a wider support, or a smaller best_return_scale.',
+                stacklevel=2,
+            )
+
+    def dump_logs(self) -> None:
+        """Write the log, with the means of the training metrics since the last time."""
+        self._record_metrics()
+        super().dump_logs()
+
+    def _record_metrics(self) -> None:
+        if self._metrics_count == 0:
+            return
+        for name, total in self._metrics.items():
+            mean = np.atleast_1d((total / self._metrics_count).cpu().numpy())
+            for i, number in enumerate(mean):
+                self.logger.record(f"train/{name}" + (f"_{i}" if len(mean) > 1 else ""), float(number))
+        self.logger.record("train/return_scale", self.policy.return_scale.factor)
+        for name, network in (("actor", self.actor), ("critic", self.critic)):
+            norms = th.stack([p.detach().square().sum() for p in network.parameters()])
+            self.logger.record(f"train/{name}_weight_norm", float(norms.sum().sqrt()))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._metrics, self._metrics_count = {}, 0
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "MOMBA",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for `total_timesteps` environment steps; SB3's signature."""
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    # ---------------------------------------------------------------------------------------------------- saving
+
+    def _excluded_save_params(self) -> list[str]:
+        derived = ["actor", "critic", "critic_target", "lr_schedule", "_metrics", "_metrics_count", "_blind_updates"]
+        return [*super()._excluded_save_params(), *derived]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        if self.ent_coef_optimizer is None:
+            return ["policy", "actor.optimizer", "critic.optimizer"], ["ent_coef_tensor"]
+        return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
+
+
+def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
+    """u_w(v) = w.v (Definition 3): the last dimension, n_objectives, is summed away."""
+    return (preferences * values).sum(dim=-1)
+
+
+def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+    """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward(inputs=parameters)
+    optimizer.step()

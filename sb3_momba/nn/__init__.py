@@ -1,0 +1,1 @@
+"""The function approximators. Nothing in here imports from the rest of the package."""

@@ -1,0 +1,175 @@
+"""SimbaV2's layers (Lee et al., 2025; section 3.3 of the thesis).
+
+`n_members=None` builds one network; an integer builds an ensemble of that many networks as one batched module, whose
+weights and activations carry the member as their first dimension.
+
+Shapes: (batch, features) for one network, (n_members, batch, features) inside an ensemble.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+EPS = 1e-8
+C_SHIFT = 3.0
+EXPANSION = 4
+
+Normalization = Callable[[th.Tensor], th.Tensor]
+
+
+def l2_normalize(x: th.Tensor) -> th.Tensor:
+    """Divide by the l2 norm of the last dimension: a point on the unit hypersphere."""
+    return x / th.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(EPS)
+
+
+def identity(x: th.Tensor) -> th.Tensor:
+    """What stands in place of `l2_normalize` where feature normalisation is switched off."""
+    return x
+
+
+def member_shape(n_members: int | None) -> tuple[int, ...]:
+    """The leading dimensions of a parameter: none, or one for the members of an ensemble."""
+    return () if n_members is None else (n_members,)
+
+
+def dense(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
+    """W x + b for one network, or for each member of an ensemble.
+
+    :param x: (batch, in), seen by every member alike, or (n_members, batch, in)
+    :param weight: (out, in) or (n_members, out, in)
+    :param bias: (out,) or (n_members, out)
+    :return: (batch, out) or (n_members, batch, out)
+    """
+    if weight.dim() == 2:
+        return F.linear(x, weight, bias)
+    x = x.expand(weight.shape[0], -1, -1)
+    if bias is None:
+        return th.bmm(x, weight.mT)
+    return th.baddbmm(bias.unsqueeze(1), x, weight.mT)
+
+
+class HyperDense(nn.Module):
+    """W x without bias, whose rows `project` puts on the unit hypersphere (weight normalisation, section 3.3)."""
+
+    def __init__(self, in_features: int, out_features: int, n_members: int | None = None):
+        super().__init__()
+        self.weight = nn.Parameter(th.empty(*member_shape(n_members), out_features, in_features))
+        for matrix in self.weight.view(-1, out_features, in_features).unbind():
+            nn.init.orthogonal_(matrix)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return dense(x, self.weight)
+
+    @th.no_grad()
+    def project(self) -> None:
+        """W_i <- W_i / ||W_i||, one row i per output unit."""
+        self.weight.copy_(l2_normalize(self.weight))
+
+
+class Scaler(nn.Module):
+    """s * x, component by component. The parameter starts at `scale` and acts as `init`: `init / scale` is its own
+    learning rate beside the optimiser's."""
+
+    def __init__(self, features: int, init: float = 1.0, scale: float = 1.0, n_members: int | None = None):
+        super().__init__()
+        # Ensembles need the batch dimension between member and feature.
+        shape = (features,) if n_members is None else (n_members, 1, features)
+        self.scaler = nn.Parameter(th.full(shape, scale))
+        self.forward_scale = init / scale
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return x * (self.scaler * self.forward_scale)
+
+
+class HyperEmbedder(nn.Module):
+    """x_emb = l2(s_e * W_e l2(x (+) c_shift)): the appended constant keeps the magnitude that the norm removes."""
+
+    def __init__(self, in_features: int, hidden_dim: int, normalize: Normalization, n_members: int | None = None):
+        super().__init__()
+        self.normalize = normalize
+        self.dense = HyperDense(in_features + 1, hidden_dim, n_members)
+        self.scaler = Scaler(hidden_dim, math.sqrt(2 / hidden_dim), math.sqrt(2 / hidden_dim), n_members)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        x = F.pad(x, (0, 1), value=C_SHIFT)
+        return self.normalize(self.scaler(self.dense(self.normalize(x))))
+
+
+class HyperLerpBlock(nn.Module):
+    """x_ffn = l2(W_2 ReLU(s_b * W_1 x)) and x_b = l2(x + a * (x_ffn - x)), where the thesis's eta is 1 - a.
+
+    :param in_features: width of what W_1 reads: `hidden_dim`, and more where the preference joins the block's input
+    """
+
+    def __init__(
+        self, in_features: int, hidden_dim: int, n_blocks: int, normalize: Normalization, n_members: int | None = None
+    ):
+        super().__init__()
+        self.normalize = normalize
+        scale = math.sqrt(2 / hidden_dim) / math.sqrt(EXPANSION)
+        self.dense1 = HyperDense(in_features, EXPANSION * hidden_dim, n_members)
+        self.scaler = Scaler(EXPANSION * hidden_dim, scale, scale, n_members)
+        self.dense2 = HyperDense(EXPANSION * hidden_dim, hidden_dim, n_members)
+        self.lerp = Scaler(hidden_dim, 1 / (n_blocks + 1), 1 / math.sqrt(hidden_dim), n_members)
+
+    def forward(self, x: th.Tensor, block_input: th.Tensor) -> th.Tensor:
+        """
+        :param x: the embedding that the block improves, (..., hidden_dim)
+        :param block_input: what W_1 reads, (..., in_features): x itself, or x with the preference appended
+        """
+        # EPS keeps a vector whose units are all off from having no direction.
+        hidden = F.relu(self.scaler(self.dense1(block_input))) + EPS
+        x_ffn = self.normalize(self.dense2(hidden))
+        return self.normalize(x + self.lerp(x_ffn - x))
+
+
+class HyperHead(nn.Module):
+    """Output prediction: dense, scaler, dense, and the network's only bias."""
+
+    def __init__(self, hidden_dim: int, out_features: int, n_members: int | None = None):
+        super().__init__()
+        self.dense1 = HyperDense(hidden_dim, hidden_dim, n_members)
+        self.scaler = Scaler(hidden_dim, n_members=n_members)
+        self.dense2 = HyperDense(hidden_dim, out_features, n_members)
+        self.bias = nn.Parameter(th.zeros(*member_shape(n_members), out_features))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return self.dense2(self.scaler(self.dense1(x))) + (self.bias if self.bias.dim() == 1 else self.bias.unsqueeze(1))
+
+
+class Linear(nn.Module):
+    """torch's Linear, its initialisation included, for one network or an ensemble."""
+
+    def __init__(self, in_features: int, out_features: int, n_members: int | None = None):
+        super().__init__()
+        layers = [nn.Linear(in_features, out_features) for _ in range(n_members or 1)]
+        shape = member_shape(n_members)
+        self.weight = nn.Parameter(th.stack([x.weight.detach() for x in layers]).view(*shape, out_features, in_features))
+        self.bias = nn.Parameter(th.stack([x.bias.detach() for x in layers]).view(*shape, out_features))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return dense(x, self.weight, self.bias)
+
+
+class Film(nn.Module):
+    """Feature-wise affine transformation (Perez et al., 2018): (1 + g(w)) * x + b(w), the identity at the start."""
+
+    def __init__(self, preference_dim: int, features: int, n_members: int | None = None):
+        super().__init__()
+        self.affine = Linear(preference_dim, 2 * features, n_members)
+        nn.init.zeros_(self.affine.weight)
+        nn.init.zeros_(self.affine.bias)
+
+    def forward(self, x: th.Tensor, preference: th.Tensor) -> th.Tensor:
+        gain, shift = self.affine(preference).chunk(2, dim=-1)
+        return (1 + gain) * x + shift
+
+
+def project_weights(network: nn.Module) -> None:
+    """Put the rows of every SimbaV2 dense layer of a network back on the unit hypersphere (Algorithm 1)."""
+    for module in network.modules():
+        if isinstance(module, HyperDense):
+            module.project()

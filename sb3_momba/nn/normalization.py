@@ -1,0 +1,85 @@
+"""Running statistics that put observations and rewards on the networks' scale (sections 3.3 and 3.4.1)."""
+
+import numpy as np
+import torch as th
+from torch import nn
+
+VARIANCE_EPS = 1e-8
+SMALLEST_RETURN = 1e-8
+
+
+class RunningStatistics(nn.Module):
+    """Mean and variance of all observations seen, by the parallel algorithm of Chan et al. (1979), in float64.
+
+    Before the second observation, normalisation only subtracts the mean.
+    """
+
+    count: th.Tensor
+    mean: th.Tensor
+    m2: th.Tensor
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.register_buffer("count", th.zeros((), dtype=th.float64))
+        self.register_buffer("mean", th.zeros(dim, dtype=th.float64))
+        self.register_buffer("m2", th.zeros(dim, dtype=th.float64))
+
+    @th.no_grad()
+    def update(self, observations: np.ndarray) -> None:
+        """:param observations: (n, dim)"""
+        batch = th.as_tensor(observations, dtype=th.float64, device=self.mean.device)
+        batch_mean = batch.mean(dim=0)
+        total = self.count + len(batch)
+        delta = batch_mean - self.mean
+        self.m2 += (batch - batch_mean).square().sum(dim=0) + delta.square() * (self.count * len(batch) / total)
+        self.mean += delta * (len(batch) / total)
+        self.count += len(batch)
+
+    @property
+    def variance(self) -> th.Tensor:
+        """(dim,), 1 before the second observation."""
+        return th.where(self.count > 1, self.m2 / self.count.clamp_min(1), 1.0)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(x - mean) / sqrt(variance + eps), (batch, dim) -> (batch, dim), float32."""
+        inverse_deviation = (self.variance + VARIANCE_EPS).rsqrt().float()
+        return (observations - self.mean.float()) * inverse_deviation
+
+
+class ReturnScale(nn.Module):
+    """Rewards are multiplied by best_return_scale / max |G_i|, the largest discounted return of any objective so far
+    (reward normalisation, section 3.4.1).
+
+    G <- gamma G + r runs along each episode of each environment. max_i |G_i| bounds |w.G| for every preference w, so one
+    rule serves the scalarised and the vector critic.
+
+    :param best_return_scale: what the best return becomes (Table B.1: 3.0), or None: rewards stay as they are
+    """
+
+    max_return: th.Tensor
+
+    def __init__(self, best_return_scale: float | None, gamma: float):
+        super().__init__()
+        self.best_return_scale = best_return_scale
+        self.gamma = gamma
+        self.register_buffer("max_return", th.zeros((), dtype=th.float64))
+        self.running_returns: np.ndarray | None = None
+
+    def update(self, rewards: np.ndarray, dones: np.ndarray) -> None:
+        """
+        :param rewards: (n_envs, n_objectives)
+        :param dones: where an episode has just ended, (n_envs,)
+        """
+        if self.running_returns is None or self.running_returns.shape != rewards.shape:
+            self.running_returns = np.zeros(rewards.shape, dtype=np.float64)
+        self.running_returns = self.gamma * self.running_returns + rewards
+        self.max_return.fill_(max(float(self.max_return), float(np.abs(self.running_returns).max())))
+        self.running_returns[dones.astype(bool)] = 0.0
+
+    @property
+    def factor(self) -> float:
+        """What a reward is multiplied by; 1 while no return is above 1e-8."""
+        largest = float(self.max_return)
+        if self.best_return_scale is None or largest < SMALLEST_RETURN:
+            return 1.0
+        return self.best_return_scale / largest

@@ -1,0 +1,185 @@
+"""SimbaPolicy and MlpPolicy: actor, critic ensemble, target critics and running statistics in one module."""
+
+from copy import deepcopy
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_momba.envs.preferences import preference_dim
+from sb3_momba.nn.layers import project_weights
+from sb3_momba.nn.networks import Actor, Architecture, Critic, MlpArchitecture, SimbaArchitecture
+from sb3_momba.nn.normalization import ReturnScale, RunningStatistics
+from sb3_momba.nn.values import DistributionalValue, ExpectedValue
+
+CRITIC_LOSSES = ("ce", "mse")
+
+
+class MombaPolicy(BasePolicy):
+    """What both policies share; a subclass chooses the architectures of actor and critic.
+
+    `actor` and `critic` read normalised observations [(s - mean) / deviation, w]; `predict` and `normalize` take raw ones.
+
+    :param n_objectives: injected by MOMBA, like critic_loss, vector_values, best_return_scale and gamma
+    :param n_critics: size of the ensemble
+    :param n_atoms: atoms of a return distribution (critic_loss="ce")
+    :param support: first and last atom, in scaled returns
+    :param normalize_observations: by their running mean and deviation
+    """
+
+    action_space: spaces.Box
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        actor_architecture: Architecture,
+        critic_architecture: Architecture,
+        *,
+        n_objectives: int = 1,
+        critic_loss: str = "ce",
+        vector_values: bool = False,
+        best_return_scale: float | None = 3.0,
+        gamma: float = 0.99,
+        n_critics: int = 2,
+        n_atoms: int = 101,
+        support: tuple[float, float] = (-5.0, 5.0),
+        normalize_observations: bool = True,
+        normalize_weights: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+        )
+        if critic_loss not in CRITIC_LOSSES:
+            raise ValueError(f"critic_loss={critic_loss!r} is not known: use one of {', '.join(CRITIC_LOSSES)}.")
+        if n_critics < 1:
+            raise ValueError(f"n_critics={n_critics}: at least one critic is needed.")
+        if n_atoms < 2 or not support[0] < support[1]:
+            raise ValueError(f"n_atoms={n_atoms}, support={support}: a support has at least 2 atoms, in rising order.")
+        self.n_objectives = n_objectives
+        self.preference_dim = preference_dim(n_objectives)
+        self.observation_dim = int(observation_space.shape[0]) - self.preference_dim
+        self.normalize_observations = normalize_observations
+        self.normalize_weights = normalize_weights
+
+        self.statistics = RunningStatistics(self.observation_dim)
+        self.return_scale = ReturnScale(best_return_scale, gamma)
+        self.value = DistributionalValue(*support, n_atoms) if critic_loss == "ce" else ExpectedValue()
+        action_dim = int(action_space.shape[0])
+        self.actor = Actor(actor_architecture, self.observation_dim, self.preference_dim, action_dim)
+        self.critic = Critic(
+            critic_architecture,
+            self.observation_dim,
+            self.preference_dim,
+            action_dim,
+            n_critics,
+            n_values=n_objectives if vector_values else 1,
+            n_atoms=self.value.n_outputs,
+        )
+        self.project_weights()
+        self.critic_target = deepcopy(self.critic).requires_grad_(False)
+        for network in (self.actor, self.critic):
+            network.optimizer = self.optimizer_class(
+                network.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **self.optimizer_kwargs,
+            )
+
+    def normalize(self, observations: th.Tensor) -> th.Tensor:
+        """[s, w] -> [(s - mean) / deviation, w]; preferences stay as they are."""
+        if not self.normalize_observations:
+            return observations
+        s, w = observations.split([self.observation_dim, self.preference_dim], dim=-1)
+        return th.cat([self.statistics(s), w], dim=-1)
+
+    def project_weights(self) -> None:
+        """Normalise the linear layers of actor and critics (Algorithm 1), unless weight normalisation is off."""
+        if self.normalize_weights:
+            project_weights(self.actor)
+            project_weights(self.critic)
+
+    def forward(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observation, deterministic)
+
+    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:  # type: ignore[override]
+        return self.actor(self.normalize(observation), deterministic)
+
+
+class SimbaPolicy(MombaPolicy):
+    """SimbaV2 actor and critics (section 3.3); the defaults are Table B.1's.
+
+    :param actor_hidden_dim: width of the actor's embedding
+    :param actor_blocks: its hidden blocks
+    :param critic_hidden_dim: width of a critic's embedding
+    :param critic_blocks: its hidden blocks
+    :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)
+    :param normalize_features: hyperspherical normalisation of activations
+    :param normalize_weights: unit-norm rows of the linear layers
+    :param kwargs: see MombaPolicy
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        actor_hidden_dim: int = 128,
+        actor_blocks: int = 2,
+        critic_hidden_dim: int = 256,
+        critic_blocks: int = 2,
+        conditioning: str = "input",
+        normalize_features: bool = True,
+        normalize_weights: bool = True,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            SimbaArchitecture(actor_hidden_dim, actor_blocks, conditioning, normalize_features),
+            SimbaArchitecture(critic_hidden_dim, critic_blocks, conditioning, normalize_features),
+            normalize_weights=normalize_weights,
+            **kwargs,
+        )
+
+
+class MlpPolicy(MombaPolicy):
+    """Dense networks with ReLU, as SB3's SAC has them (the MLP architecture of section 4.3).
+
+    :param net_arch: widths of the hidden layers, or `dict(pi=[...], qf=[...])` for actor and critics apart
+    :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)
+    :param kwargs: see MombaPolicy
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        conditioning: str = "input",
+        **kwargs: Any,
+    ):
+        if net_arch is None:
+            net_arch = [256, 256]
+        arch = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "qf": net_arch}
+        if set(arch) != {"pi", "qf"}:
+            raise ValueError(f"net_arch={net_arch!r}: give a list of widths, or dict(pi=[...], qf=[...]).")
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            MlpArchitecture(arch["pi"], conditioning),
+            MlpArchitecture(arch["qf"], conditioning),
+            normalize_weights=False,
+            **kwargs,
+        )

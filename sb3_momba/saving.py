@@ -1,0 +1,274 @@
+"""Saving and loading of models and replay buffers in sb3_momba's own files: no pickle, written aside and renamed."""
+
+import io
+import os
+import platform
+import warnings
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import stable_baselines3 as sb3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, TensorDict, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+
+from sb3_momba.buffers import PreferenceReplayBuffer
+from sb3_momba.envs.preferences import FixedSampler, PerStepSampler, UniformSampler
+from sb3_momba.envs.wrappers import n_objectives_of
+from sb3_momba.files import FileFormatError, FilePath, read_tree, register, write_tree
+
+FORMAT_VERSION = 1
+MODEL_FORMAT = "sb3_momba.model"
+BUFFER_FORMAT = "sb3_momba.replay_buffer"
+
+Self = TypeVar("Self", bound="PickleFreeSaving")
+
+
+class PickleFreeSaving(OffPolicyAlgorithm):
+    """`save`, `load` and the replay buffer's two, with SB3's signatures; loading executes nothing."""
+
+    n_objectives: int
+    replay_buffer: PreferenceReplayBuffer  # type: ignore[assignment]
+
+    def save(
+        self,
+        path: FilePath,  # type: ignore[override]
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Write the model, its optimisers and statistics into one file, ".zip" appended if it has no suffix.
+
+        The old file stands until the new one is whole.
+
+        :raises TypeError: names an attribute that cannot be stored without pickle
+        """
+        module_names, tensor_names = self._get_torch_save_params()
+        excluded = set(exclude or ()) | (set(self._excluded_save_params()) - set(include or ()))
+        excluded |= {name.split(".")[0] for name in [*module_names, *tensor_names]}
+        tree = {
+            "format": MODEL_FORMAT,
+            "version": FORMAT_VERSION,
+            "versions": library_versions(),
+            "data": {name: value for name, value in self.__dict__.items() if name not in excluded},
+            "params": self.get_parameters(),
+            "tensors": {name: recursive_getattr(self, name) for name in tensor_names},
+        }
+        write_tree(with_suffix(path, ".zip"), tree)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[Self],
+        path: FilePath,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        trust: bool = False,
+        **kwargs: Any,
+    ) -> Self:
+        """A new model from a file; SB3's signature.
+
+        :param env: to train on or check against; not needed to predict
+        :param custom_objects: attributes to use instead of those in the file, such as a learning-rate function that
+            could not be stored
+        :param print_system_info: print the library versions of the file
+        :param trust: read a zip that SB3 pickled, which can execute anything: only for files that you made yourself
+        :param kwargs: attributes to change
+        :raises FileFormatError: if the file is damaged or no model
+        :raises ValueError: if `env` has other objectives, observations or actions than the model
+        """
+        if trust:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)  # type: ignore[arg-type]
+        tree = read_format(with_existing_suffix(path, ".zip"), MODEL_FORMAT)
+        if print_system_info:
+            print(tree["versions"])
+        data = {**tree["data"], **(custom_objects or {})}
+        if "policy_kwargs" in kwargs and kwargs["policy_kwargs"] != data["policy_kwargs"]:
+            raise ValueError(
+                f"The file's policy_kwargs are {data['policy_kwargs']}, not {kwargs['policy_kwargs']}: they cannot be "
+                "changed at load."
+            )
+        for place in tree["left_out"]:
+            name = place.split(".")[1]
+            if name not in (custom_objects or {}) and name not in kwargs:
+                warnings.warn(
+                    f"{place.removeprefix('data.')} was not stored: pass custom_objects={{{name!r}: ...}} to have it back; the "
+                    "default stands in its place.",
+                    stacklevel=2,
+                )
+        if "policy_class" not in data:
+            raise ValueError("The policy class was not stored: pass custom_objects={'policy_class': YourPolicy}.")
+        if env is not None:
+            env = cls._wrap_env(env, data["verbose"])
+            _check_env_fits(env, data)
+            data["n_envs"] = env.num_envs
+            if force_reset:
+                data["_last_obs"] = None
+        model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg, arg-type]
+        model.__dict__.update(data)
+        model.__dict__.update(kwargs)
+        model._setup_model()
+        try:
+            model.set_parameters(tree["params"], exact_match=True, device=device)
+            for name, tensor in tree["tensors"].items():
+                recursive_getattr(model, name).data.copy_(tensor)
+        except (RuntimeError, KeyError, AttributeError, ValueError) as error:
+            raise FileFormatError(f"{path} holds parameters that do not fit its own settings: {error}") from error
+        return model
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """Load parameters from a file of ours, or from a dictionary as `get_parameters` gives it."""
+        if isinstance(load_path_or_dict, str | os.PathLike | io.IOBase):
+            load_path_or_dict = read_format(with_existing_suffix(load_path_or_dict, ".zip"), MODEL_FORMAT)["params"]
+        super().set_parameters(load_path_or_dict, exact_match, device)
+
+    def save_replay_buffer(self, path: FilePath) -> None:  # type: ignore[override]
+        """Write what the replay buffer holds into one file, ".npz" appended if it has no suffix."""
+        buffer = self.replay_buffer
+        tree = {
+            "format": BUFFER_FORMAT,
+            "version": FORMAT_VERSION,
+            "versions": library_versions(),
+            **{name: getattr(buffer, name) for name in ("n_envs", "n_objectives", "buffer_size", "pos", "full")},
+            "rng": buffer.rng.bit_generator.state,
+            "arrays": {name: getattr(buffer, name)[: buffer.size()] for name in BUFFER_ARRAYS},
+        }
+        write_tree(with_suffix(path, ".npz"), tree)
+
+    def load_replay_buffer(self, path: FilePath, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
+        """Put the transitions of a file into a new replay buffer of the file's size.
+
+        :param truncate_last_traj: end the last trajectory where the file ends, as after `learn` with its usual reset
+        :raises ValueError: if they are of another environment
+        """
+        tree = read_format(with_existing_suffix(path, ".npz"), BUFFER_FORMAT)
+        self._check_buffer_fits(tree)
+        self.buffer_size = tree["buffer_size"] * tree["n_envs"]
+        buffer = self._make_replay_buffer()
+        for name in BUFFER_ARRAYS:
+            array = tree["arrays"][name]
+            getattr(buffer, name)[: len(array)] = array
+        buffer.pos, buffer.full = tree["pos"], tree["full"]
+        buffer.rng.bit_generator.state = tree["rng"]
+        if truncate_last_traj and buffer.size() > 0:
+            unfinished = buffer.dones[buffer.pos - 1] == 0
+            buffer.dones[buffer.pos - 1][unfinished] = 1
+            buffer.timeouts[buffer.pos - 1][unfinished] = 1
+        self.replay_buffer = buffer
+
+    def _make_replay_buffer(self) -> PreferenceReplayBuffer:
+        raise NotImplementedError
+
+    def _check_buffer_fits(self, tree: dict[str, Any]) -> None:
+        ours = self.replay_buffer
+        for name in ("n_objectives", "n_envs"):
+            if tree[name] != getattr(ours, name):
+                raise ValueError(f"The file's buffer has {name}={tree[name]}, this model has {name}={getattr(ours, name)}.")
+        for name in BUFFER_ARRAYS:
+            theirs, mine = tree["arrays"][name].shape[1:], getattr(ours, name).shape[1:]
+            if theirs != mine:
+                raise ValueError(f"The file's {name} have shape {theirs}, this model's {mine}: another environment?")
+        size = tree["buffer_size"] if tree["full"] else tree["pos"]
+        if any(len(tree["arrays"][name]) != size for name in BUFFER_ARRAYS) or not 0 <= tree["pos"] < tree["buffer_size"]:
+            raise FileFormatError("The file's arrays do not have the length that it states.")
+
+
+BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
+
+
+def library_versions() -> dict[str, str]:
+    from sb3_momba import __version__
+
+    return {
+        "sb3_momba": __version__,
+        "stable_baselines3": sb3.__version__,
+        "torch": th.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def read_format(path: FilePath, expected: str) -> dict[str, Any]:
+    """The tree of a file of one of our formats, with `left_out` beside its own entries."""
+    tree, left_out = read_tree(path)
+    found = tree.get("format") if isinstance(tree, dict) else None
+    if found != expected:
+        raise FileFormatError(f"{path} holds {found!r}, not {expected!r}.")
+    if tree.get("version") != FORMAT_VERSION:
+        raise FileFormatError(
+            f"{path} has format version {tree.get('version')}, this sb3_momba reads {FORMAT_VERSION}: it was written by "
+            f"{tree.get('versions')}."
+        )
+    return {**tree, "left_out": left_out}
+
+
+def with_suffix(path: FilePath, suffix: str) -> FilePath:
+    """SB3's habit: a name without a suffix gets one."""
+    if isinstance(path, io.IOBase):
+        return path
+    path = Path(path)  # type: ignore[arg-type]
+    return path if path.suffix else path.with_name(path.name + suffix)
+
+
+def with_existing_suffix(path: FilePath, suffix: str) -> FilePath:
+    """The path itself if there is such a file, else with the suffix appended."""
+    if isinstance(path, io.IOBase) or Path(path).exists():  # type: ignore[arg-type]
+        return path
+    return Path(f"{os.fspath(path)}{suffix}")  # type: ignore[arg-type]
+
+
+def _check_env_fits(env: Any, data: dict[str, Any]) -> None:
+    theirs = {
+        "n_objectives": n_objectives_of(env),
+        "observation_space": env.observation_space,
+        "action_space": env.action_space,
+    }
+    for name, value in theirs.items():
+        if value != data[name]:
+            raise ValueError(f"The model was trained with {name}={data[name]}, this environment has {name}={value}.")
+
+
+def _register_box() -> None:
+    def to_tree(box: spaces.Box) -> dict[str, Any]:
+        return {"low": box.low, "high": box.high, "random": box.np_random.bit_generator.state}
+
+    def from_tree(tree: dict[str, Any]) -> spaces.Box:
+        box = spaces.Box(tree["low"], tree["high"], dtype=tree["low"].dtype)
+        box.np_random.bit_generator.state = tree["random"]
+        return box
+
+    register(spaces.Box, to_tree, from_tree)
+
+
+def _register_simple(cls: type, names: tuple[str, ...]) -> None:
+    """A class that is made anew from some of its attributes."""
+    register(
+        cls,
+        lambda x: {name: getattr(x, name) for name in names},
+        lambda tree: cls(**{name: tree[name] for name in names}),
+    )
+
+
+_register_box()
+for _sampler in (UniformSampler, FixedSampler, PerStepSampler):
+    _register_simple(_sampler, tuple(field.name for field in fields(_sampler)))
+register(TrainFreq, lambda x: [x.frequency, x.unit.value], lambda tree: TrainFreq(tree[0], TrainFrequencyUnit(tree[1])))
+_register_simple(ConstantSchedule, ("val",))
+_register_simple(LinearSchedule, ("start", "end", "end_fraction"))
+register(FloatSchedule, lambda x: x.value_schedule, FloatSchedule)
+register(
+    NormalActionNoise, lambda x: {"mean": x._mu, "sigma": x._sigma}, lambda tree: NormalActionNoise(tree["mean"], tree["sigma"])
+)

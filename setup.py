@@ -1,0 +1,45 @@
+"""The package's metadata; tools are configured in pyproject.toml."""
+
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+ROOT = Path(__file__).parent
+VERSION = re.search(r'__version__ = "(.+)"', (ROOT / "sb3_momba" / "__init__.py").read_text()).group(1)
+
+setup(
+    name="sb3-momba",
+    version=VERSION,
+    description="Multi-objective reinforcement learning for Stable-Baselines3: one run learns the whole Pareto front",
+    long_description=(ROOT / "README.md").read_text(),
+    long_description_content_type="text/markdown",
+    license="MIT",
+    license_files=["LICENSE"],
+    packages=find_packages(include=["sb3_momba", "sb3_momba.*"]),
+    package_data={"sb3_momba": ["py.typed", "envs/riesz_100.npz", "hyperparams/*.yml"]},
+    python_requires=">=3.10",
+    install_requires=[
+        "stable-baselines3>=2.9,<3",
+        "torch>=2.4",
+        "gymnasium[mujoco]>=1.1",
+        "mo-gymnasium>=1.3",
+        "moocore>=0.3",
+        "numpy>=1.26",
+        "matplotlib>=3.8",
+        "tensorboard>=2.15",
+        "tqdm>=4.66",
+        "rich>=13",
+        "pyyaml>=6",
+    ],
+    extras_require={
+        "baselines": ["morl-baselines>=1.3"],
+        "test": ["pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.100", "ruff>=0.15", "mypy>=1.15", "types-PyYAML"],
+    },
+    classifiers=[
+        "Intended Audience :: Science/Research",
+        "Programming Language :: Python :: 3",
+        "Topic :: Scientific/Engineering :: Artificial Intelligence",
+        "Typing :: Typed",
+    ],
+)
