@@ -5,5 +5,25 @@ __version__ = "0.1.0"
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.envs.wrappers import PreferenceWrapper, make_mo_vec_env
 from sb3_momba.momba import MOMBA
+from sb3_momba.pareto.callbacks import ParetoEvalCallback
+from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
+from sb3_momba.pareto.metrics import expected_utility, hypervolume, inverted_generational_distance, preference_regret
+from sb3_momba.pareto.plotting import plot_front
 from sb3_momba.policies import MlpPolicy, SimbaPolicy
 
+__all__ = [
+    "MOMBA",
+    "MlpPolicy",
+    "ParetoEvalCallback",
+    "ParetoFront",
+    "PreferenceReplayBuffer",
+    "PreferenceWrapper",
+    "SimbaPolicy",
+    "evaluate_front",
+    "expected_utility",
+    "hypervolume",
+    "inverted_generational_distance",
+    "make_mo_vec_env",
+    "plot_front",
+    "preference_regret",
+]

@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_momba.envs.preferences import preference_dim
+from sb3_momba.envs.wrappers import LARGEST_REWARD
 
 SMALLEST_CONCENTRATION = 1e-3
 
@@ -103,6 +104,10 @@ class PreferenceReplayBuffer(ReplayBuffer):
         :param infos: with `vector_reward` from PreferenceWrapper
         """
         vector_rewards = self._vector_rewards(reward, infos)
+        if not np.isfinite(next_obs).all():
+            raise ValueError(
+                f"Environment {int((~np.isfinite(next_obs)).any(axis=1).argmax())}: a number of {next_obs} is not finite."
+            )
         raw = self.observation_dim
         if self.preference_dim > 0:
             self.preferences[self.pos] = obs[:, raw:]
@@ -112,6 +117,13 @@ class PreferenceReplayBuffer(ReplayBuffer):
     def latest_rewards(self) -> np.ndarray:
         """Of the step stored last, (n_envs, n_objectives)."""
         return self.rewards[self.pos - 1]
+
+    def end_episodes(self) -> None:
+        """Truncate the trajectories that are not finished, as when the environments are reset from outside."""
+        if self.size() > 0:
+            unfinished = self.dones[self.pos - 1] == 0
+            self.dones[self.pos - 1][unfinished] = 1
+            self.timeouts[self.pos - 1][unfinished] = 1
 
     def _vector_rewards(self, reward: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         expected = (self.n_envs, self.n_objectives)
@@ -135,8 +147,13 @@ class PreferenceReplayBuffer(ReplayBuffer):
                 f"Environment {index}: info has no 'vector_reward'. A wrapper outside PreferenceWrapper drops it: put that "
                 "wrapper inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
             )
-        if not np.isfinite(rewards).all():
-            raise ValueError(f"The rewards {rewards.tolist()} of {self.n_envs} environments are not all finite.")
+        wrong = ~(np.abs(rewards) <= LARGEST_REWARD)
+        if wrong.any():
+            index, objective = np.argwhere(wrong)[0]
+            raise ValueError(
+                f"Environment {index}: the reward of objective {objective} is {rewards[index, objective]}: rewards must be "
+                f"finite and at most {LARGEST_REWARD:g} in size. It was not stored."
+            )
         return rewards
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> PreferenceReplayBufferSamples:  # type: ignore[override]

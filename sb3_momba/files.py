@@ -239,7 +239,7 @@ def _find_class(name: str) -> type:
     for i in range(len(name) - 1, 0, -1):
         if name[i] == "." and name[:i] in sys.modules:
             cls = getattr(sys.modules[name[:i]], name[i + 1 :], None)
-            if nameable_class(cls):
+            if isinstance(cls, type) and nameable_class(cls):
                 return cls
             break
     raise FileFormatError(f"it names the class {name!r}, which is no known module, optimiser or buffer of {TRUSTED_ROOTS}.")

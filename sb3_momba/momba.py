@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -282,18 +283,18 @@ class MOMBA(PickleFreeSaving):
         """
         return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
 
-    def _with_preference(
-        self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None
-    ) -> np.ndarray:
+    def _with_preference(self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None) -> np.ndarray:
         if isinstance(observation, tuple | dict):
             return observation  # the policy's own error
         observation = np.asarray(observation)
+        if not np.isfinite(observation).all():
+            raise ValueError(f"The observation {observation} has a number that is not finite: no action answers it.")
         raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
         width = observation.shape[-1] if observation.ndim > 0 else 0
         if preference is None:
             if width == raw != wrapped:
                 raise ValueError(
-                    f"This observation has no preference: predict(observation, preference=[...]) with {self.n_objectives} weights."
+                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights."
                 )
             return observation
         w = check_preference(preference, self.n_objectives)
@@ -324,6 +325,20 @@ class MOMBA(PickleFreeSaving):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
         self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """SB3's; where it resets the environments, the episodes that were going on end here."""
+        if reset_num_timesteps or self._last_obs is None:
+            self.policy.return_scale.end_episodes()
+            self.replay_buffer.end_episodes()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     # -------------------------------------------------------------------------------------------------- learning
 
@@ -382,9 +397,7 @@ class MOMBA(PickleFreeSaving):
             }
         return loss, metrics
 
-    def _actor_loss(
-        self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor, Metrics]:
+    def _actor_loss(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> tuple[th.Tensor, th.Tensor, Metrics]:
         """Eq. (3.18), with eq. (3.21)'s alignment if it is on. Also returns log pi(a | s, w), (batch,)."""
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         q_vector = self.policy.value.mean(self.critic(batch.observations, actions))
@@ -397,6 +410,7 @@ class MOMBA(PickleFreeSaving):
     def _alpha_loss(self, log_prob: th.Tensor) -> th.Tensor:
         """Eq. (3.19) with alpha = exp(beta)."""
         assert self.log_ent_coef is not None
+        assert isinstance(self.target_entropy, float)
         return -(self.log_ent_coef.exp() * (log_prob + self.target_entropy)).mean()
 
     @property
@@ -478,5 +492,5 @@ def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
     """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     optimizer.zero_grad(set_to_none=True)
-    loss.backward(inputs=parameters)
+    loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
     optimizer.step()

@@ -96,9 +96,10 @@ class MombaPolicy(BasePolicy):
 
     def normalize(self, observations: th.Tensor) -> th.Tensor:
         """[s, w] -> [(s - mean) / deviation, w]; preferences stay as they are."""
+        observations = observations.float()
         if not self.normalize_observations:
             return observations
-        s, w = observations.split([self.observation_dim, self.preference_dim], dim=-1)
+        s, w = observations[:, : self.observation_dim], observations[:, self.observation_dim :]
         return th.cat([self.statistics(s), w], dim=-1)
 
     def project_weights(self) -> None:

@@ -4,6 +4,7 @@ import io
 import os
 import platform
 import warnings
+import zipfile
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
@@ -15,14 +16,15 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, TensorDict, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.type_aliases import GymEnv, TensorDict, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.envs.preferences import FixedSampler, PerStepSampler, UniformSampler
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.files import FileFormatError, FilePath, read_tree, register, write_tree
+from sb3_momba.policies import MombaPolicy
 
 FORMAT_VERSION = 1
 MODEL_FORMAT = "sb3_momba.model"
@@ -87,7 +89,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         """
         if trust:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)  # type: ignore[arg-type]
-        tree = read_format(with_existing_suffix(path, ".zip"), MODEL_FORMAT)
+        tree = read_model(path)
         if print_system_info:
             print(tree["versions"])
         data = {**tree["data"], **(custom_objects or {})}
@@ -106,6 +108,9 @@ class PickleFreeSaving(OffPolicyAlgorithm):
                 )
         if "policy_class" not in data:
             raise ValueError("The policy class was not stored: pass custom_objects={'policy_class': YourPolicy}.")
+        for name, value in data.items():
+            if isinstance(value, type) and not issubclass(value, CLASSES_AT.get(name, ())):
+                raise FileFormatError(f"{path}: {name} is the class {value.__name__}, which does not belong there.")
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
             _check_env_fits(env, data)
@@ -132,7 +137,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     ) -> None:
         """Load parameters from a file of ours, or from a dictionary as `get_parameters` gives it."""
         if isinstance(load_path_or_dict, str | os.PathLike | io.IOBase):
-            load_path_or_dict = read_format(with_existing_suffix(load_path_or_dict, ".zip"), MODEL_FORMAT)["params"]
+            load_path_or_dict = read_model(load_path_or_dict)["params"]
         super().set_parameters(load_path_or_dict, exact_match, device)
 
     def save_replay_buffer(self, path: FilePath) -> None:  # type: ignore[override]
@@ -163,10 +168,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             getattr(buffer, name)[: len(array)] = array
         buffer.pos, buffer.full = tree["pos"], tree["full"]
         buffer.rng.bit_generator.state = tree["rng"]
-        if truncate_last_traj and buffer.size() > 0:
-            unfinished = buffer.dones[buffer.pos - 1] == 0
-            buffer.dones[buffer.pos - 1][unfinished] = 1
-            buffer.timeouts[buffer.pos - 1][unfinished] = 1
+        if truncate_last_traj:
+            buffer.end_episodes()
         self.replay_buffer = buffer
 
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:
@@ -186,6 +189,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             raise FileFormatError("The file's arrays do not have the length that it states.")
 
 
+# What an attribute of a model that is a class may be.
+CLASSES_AT = {"policy_class": MombaPolicy, "replay_buffer_class": PreferenceReplayBuffer}
 BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
 
 
@@ -213,6 +218,23 @@ def read_format(path: FilePath, expected: str) -> dict[str, Any]:
             f"{tree.get('versions')}."
         )
     return {**tree, "left_out": left_out}
+
+
+def read_model(path: FilePath) -> dict[str, Any]:
+    """The tree of a model's file, complete."""
+    path = with_existing_suffix(path, ".zip")
+    if zipfile.is_zipfile(path):  # type: ignore[arg-type]
+        with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
+            if "tree.json" not in archive.namelist() and "_stable_baselines3_version" in archive.namelist():
+                raise FileFormatError(
+                    f"{path} was pickled by Stable-Baselines3: loading it can execute anything. If you made it yourself, "
+                    "MOMBA.load(..., trust=True) reads it."
+                )
+    tree = read_format(path, MODEL_FORMAT)
+    for part in ("data", "params", "tensors"):
+        if not isinstance(tree.get(part), dict):
+            raise FileFormatError(f"{path} has no {part!r}: it is not a whole model.")
+    return tree
 
 
 def with_suffix(path: FilePath, suffix: str) -> FilePath:

@@ -100,8 +100,8 @@ def preference_grid(n_objectives: int, n_preferences: int = 100) -> np.ndarray:
     """Equally spaced preferences on the simplex (section 4.1.2).
 
     Two objectives: `linspace`, exactly n. Three to six: 100 points of least Riesz energy (Blank et al., 2021), computed
-    with pymoo's `get_reference_directions("energy", d, 100, seed=1)`. Any other n: the smallest simplex lattice with at least n points, said in
-    the log.
+    with pymoo's `get_reference_directions("energy", d, 100, seed=1)`. Any other n: the smallest simplex lattice with at
+    least n points, said in the log.
 
     :return: float64 (n, n_objectives)
     """
@@ -120,6 +120,9 @@ def preference_grid(n_objectives: int, n_preferences: int = 100) -> np.ndarray:
     grid = simplex_lattice(n_objectives, divisions)
     if len(grid) != n_preferences:
         logger.warning(
-            "%d preferences asked for %d objectives: the nearest simplex lattice has %d.", n_preferences, n_objectives, len(grid)
+            "%d preferences asked for %d objectives: the nearest simplex lattice has %d.",
+            n_preferences,
+            n_objectives,
+            len(grid),
         )
     return grid

@@ -48,6 +48,11 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         check_spaces(env.observation_space, env.action_space)
         self.n_objectives = count_objectives(env)
         self.declares_objectives = declared_reward_space(env) is not None
+        if self.declares_objectives and Monitor in wrapper_layers(env):
+            raise ValueError(
+                "This environment has a vector reward inside Monitor, which needs a scalar: build it as "
+                "Monitor(PreferenceWrapper(env)) or with make_mo_vec_env."
+            )
         self.preference_dim = preference_dim(self.n_objectives)
         self.env_index = 0
         self.preference_sampler: PreferenceSampler = preference_sampler or UniformSampler(self.n_objectives)
@@ -59,6 +64,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
         box = env.observation_space
         assert isinstance(box, spaces.Box)
+        self.raw_shape = box.shape
         self.observation_space = spaces.Box(
             np.concatenate([box.low, np.zeros(self.preference_dim)]).astype(np.float32),
             np.concatenate([box.high, np.ones(self.preference_dim)]).astype(np.float32),
@@ -73,6 +79,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def set_preference(self, preference: Sequence[float] | np.ndarray | None) -> None:
         """Fix the preference from the next observation on; None hands it back to the sampler."""
         self._fixed_preference = None if preference is None else self._one_preference(preference)
+        self._holds_for_episode = self._holds_for_episode and preference is None
 
     def set_preference_sampler(self, sampler: PreferenceSampler | None) -> None:
         """Draw preferences with `sampler` from the next draw on; None: uniform on the simplex."""
@@ -82,9 +89,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         """The environment's place in its VecEnv, for error messages."""
         self.env_index = index
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """`options["preference"]`, (n_objectives,), holds for this episode; all other options go to the environment."""
         given = None
         if options is not None and "preference" in options:
@@ -126,6 +131,11 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def _observe(self, observation: np.ndarray) -> np.ndarray:
         """[observation, w], always a fresh array: the environment may use its own again."""
         assert self._preference is not None
+        if np.shape(observation) != self.raw_shape:
+            raise ValueError(
+                f"{self._where()}: the observation has shape {np.shape(observation)} where {self.raw_shape} is declared: "
+                "return what observation_space says."
+            )
         w = self._preference if self.preference_dim > 0 else self._preference[:0]
         wrapped = np.concatenate([observation, w], dtype=np.float32)
         if not np.isfinite(wrapped).all():
@@ -138,16 +148,18 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def _check_reward(self, reward: Any) -> np.ndarray:
         """The reward as a fresh float32 (n_objectives,), or an error that names the environment, step and objective."""
         try:
-            vector = np.array(reward, dtype=np.float64)
+            vector = np.asarray(reward)
+            if vector.dtype.kind not in "biuf":
+                raise TypeError(f"dtype {vector.dtype}")
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{self._where()}: the reward {reward!r} is not made of numbers.") from error
+            raise ValueError(f"{self._where()}: the reward {reward!r} is not made of numbers: return floats.") from error
         expected = (self.n_objectives,) if self.declares_objectives else ()
         if vector.shape != expected:
             cure = "return one number per objective of reward_space" if self.declares_objectives else HOW_TO_DECLARE
             raise ValueError(
                 f"{self._where()}: the reward {reward!r} has shape {vector.shape} where {expected} is declared: {cure}."
             )
-        vector = vector.reshape(self.n_objectives)
+        vector = vector.reshape(self.n_objectives).astype(np.float64)
         wrong = ~(np.abs(vector) <= LARGEST_REWARD)
         if wrong.any():
             raise ValueError(
@@ -181,7 +193,7 @@ def count_objectives(env: gym.Env) -> int:
     return 1 if space is None else int(space.shape[0])
 
 
-def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """
     :raises ValueError: where observations are not a one-dimensional Box, or actions not a bounded Box
     """
@@ -192,6 +204,10 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
         )
     if not isinstance(action_space, spaces.Box):
         raise ValueError(f"The action space {action_space} is not supported: MOMBA needs continuous actions, a Box.")
+    if len(action_space.shape) != 1 or action_space.shape[0] == 0:
+        raise ValueError(
+            f"The action space {action_space} has shape {action_space.shape}: flatten it to (n,) with an ActionWrapper."
+        )
     low, high = action_space.low, action_space.high
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(
@@ -224,11 +240,6 @@ def wrap_env(env: gym.Env, preference_sampler: PreferenceSampler | None = None) 
     if has_preference and preference_sampler is not None:
         env.get_wrapper_attr("set_preference_sampler")(preference_sampler)
     if not has_preference:
-        if has_monitor and declared_reward_space(env) is not None:
-            raise ValueError(
-                "This environment has a vector reward inside Monitor, which needs a scalar: build it as "
-                "Monitor(PreferenceWrapper(env)), or give the environment without its Monitor."
-            )
         env = PreferenceWrapper(env, preference_sampler)
     return env if has_monitor else Monitor(env)  # type: ignore[return-value]
 
@@ -289,6 +300,12 @@ def check_vec_env(venv: VecEnv) -> None:
         n_objectives = venv.get_attr("n_objectives")
         if len(set(n_objectives)) > 1:
             raise ValueError(f"The environments of this VecEnv differ in their numbers of objectives: {n_objectives}.")
+        inside = venv.get_attr("raw_shape")[0][0] + preference_dim(n_objectives[0])
+        if venv.observation_space.shape != (inside,):
+            raise ValueError(
+                f"A wrapper outside PreferenceWrapper changes [observation, preference] from ({inside},) to "
+                f"{venv.observation_space.shape}: put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
+            )
     elif any(wrapped) or venv.has_attr("reward_space"):
         raise ValueError(
             "This VecEnv has vector rewards without PreferenceWrapper: vector rewards do not pass through a VecEnv. Build it "

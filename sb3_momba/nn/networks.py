@@ -75,9 +75,7 @@ class SimbaTrunk(Trunk):
             HyperLerpBlock(hidden_dim + self.appended_dim, hidden_dim, n_blocks, self.normalize, n_members)
             for _ in range(n_blocks)
         )
-        self.films = nn.ModuleList(
-            Film(preference_dim, hidden_dim, n_members) for _ in range(n_blocks) if self.film_dim > 0
-        )
+        self.films = nn.ModuleList(Film(preference_dim, hidden_dim, n_members) for _ in range(n_blocks) if self.film_dim > 0)
 
     def forward(self, x: th.Tensor, preference: th.Tensor) -> th.Tensor:
         x = self.embedder(x)

@@ -76,6 +76,10 @@ class ReturnScale(nn.Module):
         self.max_return.fill_(max(float(self.max_return), float(np.abs(self.running_returns).max())))
         self.running_returns[dones.astype(bool)] = 0.0
 
+    def end_episodes(self) -> None:
+        """The next rewards begin new returns, in any number of environments."""
+        self.running_returns = None
+
     @property
     def factor(self) -> float:
         """What a reward is multiplied by; 1 while no return is above 1e-8."""

@@ -18,9 +18,7 @@ class ValueRepresentation(Protocol):
     def mean(self, outputs: th.Tensor) -> th.Tensor:
         """Q, the expected return that a critic's outputs stand for, (batch, n_critics, n_values)."""
 
-    def bootstrap(
-        self, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, bonus: th.Tensor
-    ) -> th.Tensor:
+    def bootstrap(self, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, bonus: th.Tensor) -> th.Tensor:
         """Targets r + discount * (next return + bonus), (batch, n_critics, n_values, n_outputs).
 
         :param next_outputs: of the target critics at (s', a', w)
@@ -53,9 +51,7 @@ class DistributionalValue(nn.Module):
         """Eqs. (3.6), (3.12) and (3.15)."""
         return expectation(outputs.softmax(dim=-1), self.support)
 
-    def bootstrap(
-        self, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, bonus: th.Tensor
-    ) -> th.Tensor:
+    def bootstrap(self, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, bonus: th.Tensor) -> th.Tensor:
         """Phi(r + gamma (1 - delta) (Z - alpha log pi)), eqs. (3.11), (3.14) and section 3.4.2: the entropy term shifts
         the atoms."""
         atoms = discounts[:, None] * (self.support + bonus[:, None])  # (batch, n_atoms)
@@ -83,9 +79,7 @@ class ExpectedValue(nn.Module):
     def mean(self, outputs: th.Tensor) -> th.Tensor:
         return outputs.squeeze(-1)
 
-    def bootstrap(
-        self, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, bonus: th.Tensor
-    ) -> th.Tensor:
+    def bootstrap(self, next_outputs: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, bonus: th.Tensor) -> th.Tensor:
         """r + gamma (1 - delta) (Q - alpha log pi), eqs. (2.8) and (3.3)."""
         discounts, bonus = discounts[:, None, None, None], bonus[:, None, None, None]
         return rewards[:, None, :, None] + discounts * (next_outputs + bonus)

@@ -1,0 +1,42 @@
+"""Five minutes on two CPU cores: small networks on MO-Hopper, beside policies that have learned nothing."""
+
+import time
+
+import numpy as np
+
+from sb3_momba import evaluate_front, make_mo_vec_env
+from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy
+from sb3_momba.train import RunSettings, report, run
+
+ENV = "mo-hopper-2obj-v5"
+EVALUATION = {"n_preferences": 20, "n_episodes": 2}
+
+action_space = make_mo_vec_env(ENV).action_space
+floors = {
+    "standing still": evaluate_front(ZeroActionPolicy(action_space), ENV, **EVALUATION),
+    "random actions": evaluate_front(RandomPolicy(action_space), ENV, **EVALUATION),
+}
+started = time.monotonic()
+result = run(
+    RunSettings(
+        env=ENV,
+        output=f"runs/demo/{time.strftime('%Y%m%d-%H%M%S')}",
+        steps=30_000,
+        eval_freq=5_000,
+        objectives=["forward speed", "jumping height"],
+        hyperparameters={
+            "ent_coef": "auto_0.01",
+            "learning_rate": 3e-4,
+            "learning_starts": 1_000,
+            "policy_kwargs": {"actor_hidden_dim": 64, "actor_blocks": 1, "critic_hidden_dim": 64, "critic_blocks": 2},
+        },
+        **EVALUATION,
+    )
+)
+print(f"\n{ENV}, {time.monotonic() - started:.0f} s")
+for name, front in floors.items():
+    print(f"{name:>17}  {front.hypervolume():>17,.6g}")
+print(report(result))
+floor = max(front.hypervolume() for front in floors.values())
+print(f"Hypervolume {result.front.hypervolume() / floor:.1f} times that of the better of them.")
+assert np.isfinite(result.front.values).all()

@@ -1,0 +1,1 @@
+"""What comes out: numbers, rollouts, callbacks and pictures of Pareto fronts."""

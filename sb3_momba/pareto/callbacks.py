@@ -1,0 +1,138 @@
+"""Evaluating the Pareto front while the model trains."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.logger import Figure as LoggedFigure
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_momba.files import atomic_write
+from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
+from sb3_momba.pareto.plotting import plot_front
+
+
+class ParetoEvalCallback(EventCallback):
+    """Evaluate the front every `eval_freq` environment steps and at the end of the training.
+
+    Records `pareto/hypervolume`, `pareto/expected_utility`, `pareto/preference_regret` and `pareto/n_non_dominated`, and
+    the front's picture where the logger takes figures. `last_mean_reward` and `best_mean_reward` are hypervolumes, so
+    that callbacks made for SB3's EvalCallback work.
+
+    :param eval_env: id, callable, environment or VecEnv; see `evaluate_front`
+    :param eval_freq: environment steps, over all training environments
+    :param reference_point: of the hypervolume, (n_objectives,); 0 by default
+    :param log_path: folder for `pareto_evaluations.npz`, `front.npz` and `front.png`
+    :param best_model_save_path: folder for `best_model.zip`, the model of the largest hypervolume
+    :param callback_on_new_best: called after each new best hypervolume
+    :param callback_after_eval: called after each evaluation; may stop the training
+    """
+
+    def __init__(
+        self,
+        eval_env: str | gym.Env | VecEnv,
+        eval_freq: int = 50_000,
+        n_preferences: int = 100,
+        n_episodes: int = 5,
+        seed: int = 0,
+        reference_point: ArrayLike | None = None,
+        deterministic: bool = True,
+        log_path: str | os.PathLike[str] | None = None,
+        best_model_save_path: str | os.PathLike[str] | None = None,
+        callback_on_new_best: BaseCallback | None = None,
+        callback_after_eval: BaseCallback | None = None,
+        objectives: list[str] | None = None,
+        verbose: int = 1,
+    ):
+        super().__init__(callback_after_eval, verbose=verbose)
+        if eval_freq < 1:
+            raise ValueError(f"eval_freq={eval_freq}: give the number of environment steps between evaluations.")
+        self.eval_env = eval_env
+        self.eval_freq = int(eval_freq)
+        self.evaluation_kwargs: dict[str, Any] = {
+            "n_preferences": n_preferences,
+            "n_episodes": n_episodes,
+            "seed": seed,
+            "deterministic": deterministic,
+        }
+        self.reference_point = reference_point
+        self.log_path = None if log_path is None else Path(log_path)
+        self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
+        self.callback_on_new_best = callback_on_new_best
+        self.objectives = objectives
+        self.front: ParetoFront | None = None
+        self.timesteps: list[int] = []
+        self.metrics: list[dict[str, float]] = []
+        self.values: list[np.ndarray] = []
+        self.last_mean_reward = -np.inf
+        self.best_mean_reward = -np.inf
+
+    def _init_callback(self) -> None:
+        self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
+        if self.callback_on_new_best is not None:
+            self.callback_on_new_best.parent = self
+            self.callback_on_new_best.init_callback(self.model)
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps < self.next_evaluation:
+            return True
+        self.next_evaluation = (self.num_timesteps // self.eval_freq + 1) * self.eval_freq
+        return self._evaluate()
+
+    def _on_training_end(self) -> None:
+        if not self.timesteps or self.timesteps[-1] != self.model.num_timesteps:
+            self.num_timesteps = self.model.num_timesteps
+            self._evaluate()
+
+    def _evaluate(self) -> bool:
+        self.front = front = evaluate_front(self.model, self.eval_env, **self.evaluation_kwargs)  # type: ignore[arg-type]
+        measured = {
+            "hypervolume": front.hypervolume(self.reference_point),
+            "expected_utility": front.expected_utility(),
+            "preference_regret": front.preference_regret(),
+            "n_non_dominated": float(front.non_dominated().sum()),
+        }
+        self.timesteps.append(self.num_timesteps)
+        self.metrics.append(measured)
+        self.values.append(front.values)
+        self.last_mean_reward = measured["hypervolume"]
+        self._log(front, measured)
+        if self.log_path is not None:
+            self._write(front)
+
+        continue_training = True
+        if self.last_mean_reward > self.best_mean_reward:
+            self.best_mean_reward = self.last_mean_reward
+            if self.best_model_save_path is not None:
+                self.model.save(self.best_model_save_path / "best_model.zip")
+            if self.callback_on_new_best is not None:
+                continue_training = self.callback_on_new_best.on_step()
+        if self.callback is not None:
+            continue_training = self._on_event() and continue_training
+        return continue_training
+
+    def _log(self, front: ParetoFront, measured: dict[str, float]) -> None:
+        for name, value in measured.items():
+            self.logger.record(f"pareto/{name}", value)
+        if front.n_objectives in (2, 3):
+            picture = plot_front(front, objectives=self.objectives, title=f"{self.num_timesteps:,} steps")
+            self.logger.record("pareto/front", LoggedFigure(picture, close=True), exclude=("stdout", "log", "json", "csv"))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+
+    def _write(self, front: ParetoFront) -> None:
+        assert self.log_path is not None
+        front.save(self.log_path / "front.npz")
+        if front.n_objectives in (2, 3):
+            title = f"{front.settings['env']}, {self.num_timesteps:,} steps"
+            plot_front(front, self.log_path / "front.png", self.objectives, title)
+        with atomic_write(self.log_path / "pareto_evaluations.npz") as file:
+            arrays = {name: np.array([m[name] for m in self.metrics]) for name in self.metrics[0]}
+            arrays["timesteps"] = np.array(self.timesteps)
+            arrays["preferences"] = front.preferences
+            arrays["values"] = np.stack(self.values)  # (evaluations, P, n_objectives)
+            np.savez(file, allow_pickle=False, **arrays)

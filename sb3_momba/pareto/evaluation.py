@@ -1,0 +1,210 @@
+"""Rolling out a policy under a grid of preferences (section 4.1.2)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_momba.envs.preferences import check_preference, preference_grid
+from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
+from sb3_momba.files import FileFormatError, FilePath, read_tree, write_tree
+from sb3_momba.pareto import metrics
+
+MAX_PARALLEL_EPISODES = 128
+FRONT_FORMAT = "sb3_momba.front"
+
+Array = NDArray[np.float64]
+
+
+class Predictor(Protocol):
+    """Anything with SB3's `predict` on the wrapped environment's observations [s, w]."""
+
+    def predict(self, observation: Any, *, deterministic: bool) -> tuple[np.ndarray, Any]: ...
+
+
+@dataclass
+class ParetoFront:
+    """What a policy earned under each preference.
+
+    :param preferences: (P, n_objectives)
+    :param returns: undiscounted vector returns, (P, E, n_objectives), E episodes per preference
+    :param discounted_returns: likewise
+    :param episode_lengths: in steps, (P, E)
+    :param settings: how it was measured
+    """
+
+    preferences: Array
+    returns: Array
+    discounted_returns: Array
+    episode_lengths: NDArray[np.int64]
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def values(self) -> Array:
+        """Mean return of each preference, (P, n_objectives)."""
+        return np.asarray(self.returns.mean(axis=1))
+
+    @property
+    def n_objectives(self) -> int:
+        return int(self.preferences.shape[1])
+
+    def non_dominated(self) -> NDArray[np.bool_]:
+        """Which preferences' values no other one dominates, (P,)."""
+        return metrics.non_dominated(self.values)
+
+    def hypervolume(self, reference_point: ArrayLike | None = None) -> float:
+        """Eq. (4.1); the reference point is 0 by default."""
+        return metrics.hypervolume(self.values, np.zeros(self.n_objectives) if reference_point is None else reference_point)
+
+    def expected_utility(self) -> float:
+        """Eq. (4.2), over the evaluated preferences."""
+        return metrics.expected_utility(self.values, self.preferences)
+
+    def preference_regret(self) -> float:
+        """What asking for a preference loses against the best policy found for it."""
+        return metrics.preference_regret(self.values, self.preferences)
+
+    def save(self, path: FilePath) -> None:
+        """Write one file, atomically and without pickle."""
+        write_tree(path, {"format": FRONT_FORMAT, **vars(self)})
+
+    @classmethod
+    def load(cls, path: FilePath) -> "ParetoFront":
+        """:raises FileFormatError: if the file is damaged or no front"""
+        tree, _ = read_tree(path)
+        if not isinstance(tree, dict) or tree.pop("format", None) != FRONT_FORMAT:
+            raise FileFormatError(f"{path} holds no Pareto front.")
+        return cls(**tree)
+
+
+def evaluate_front(
+    model: Predictor,
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env],
+    n_preferences: int = 100,
+    n_episodes: int = 5,
+    seed: int = 0,
+    preferences: ArrayLike | None = None,
+    gamma: float | None = None,
+    deterministic: bool = True,
+    env_kwargs: dict[str, Any] | None = None,
+) -> ParetoFront:
+    """Roll a policy out under each preference, all episodes together, one `predict` per step.
+
+    Episode e of every preference starts from seed + e. An environment class without any randomness may declare
+    `deterministic = True`: with a deterministic policy one episode then stands for all.
+
+    :param model: anything with `predict` on observations [s, w]
+    :param env: an id or a callable runs up to 128 copies side by side; a VecEnv as many as it has; an environment that
+        exists already, one episode after the other
+    :param n_preferences: how many equally spaced preferences; see `preference_grid`
+    :param preferences: to evaluate instead, (P, n_objectives)
+    :param gamma: of the discounted returns; the model's own by default, 0.99 where it has none
+    :param deterministic: the policy's mean action
+    :return: P preferences in the order of the grid
+    """
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes={n_episodes}: at least one episode is needed.")
+    gamma = float(getattr(model, "gamma", 0.99)) if gamma is None else gamma
+    probe = _probe(env, env_kwargs)
+    grid = preference_grid(probe.n_objectives, n_preferences) if preferences is None else np.atleast_2d(preferences)
+    grid = check_preference(grid, probe.n_objectives).astype(np.float64)
+    n_run = 1 if probe.deterministic and deterministic else n_episodes
+    jobs = [(w, seed + episode) for w in grid for episode in range(n_run)]
+
+    venv, is_ours = _make_vec_env(env, min(len(jobs), MAX_PARALLEL_EPISODES), env_kwargs)
+    try:
+        returns, discounted, lengths = _run_jobs(model, venv, jobs, gamma, deterministic)
+    finally:
+        if is_ours:
+            venv.close()
+    settings = {
+        "env": probe.name,
+        "seed": seed,
+        "gamma": gamma,
+        "deterministic_policy": deterministic,
+        "deterministic_env": probe.deterministic,
+    }
+    shape = (len(grid), n_run)
+    return ParetoFront(grid, returns.reshape(*shape, -1), discounted.reshape(*shape, -1), lengths.reshape(shape), settings)
+
+
+def _run_jobs(
+    model: Predictor, venv: VecEnv, jobs: Sequence[tuple[np.ndarray, int]], gamma: float, deterministic: bool
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Each environment takes the next (preference, seed) as soon as its episode ends; idle ones go on unheard, so that the
+    policy always sees one batch shape."""
+    n_objectives = jobs[0][0].size
+    returns, discounted = np.zeros((2, len(jobs), n_objectives))
+    lengths = np.zeros(len(jobs), dtype=np.int64)
+    observations = np.array(venv.reset())
+    waiting = iter(enumerate(jobs))
+    job_of: list[int | None] = [None] * venv.num_envs
+
+    def start_next(index: int) -> None:
+        job = next(waiting, None)
+        job_of[index] = None if job is None else job[0]
+        if job is not None:
+            w, seed = job[1]
+            options = {"preference": w} if n_objectives > 1 else None
+            observations[index] = venv.env_method("reset", seed=seed, options=options, indices=[index])[0][0]
+
+    for index in range(venv.num_envs):
+        start_next(index)
+    # Sampling actions must not disturb the random numbers of a training that is going on.
+    with th.random.fork_rng(enabled=not deterministic):
+        if not deterministic:
+            th.manual_seed(jobs[0][1])
+        while any(job is not None for job in job_of):
+            actions, _ = model.predict(observations, deterministic=deterministic)
+            next_observations, scalars, dones, infos = venv.step(actions)
+            observations = np.array(next_observations)
+            for index, job in enumerate(job_of):
+                if job is None:
+                    continue
+                reward = np.asarray(infos[index].get("vector_reward", [scalars[index]]), dtype=np.float64)
+                returns[job] += reward
+                discounted[job] += gamma ** lengths[job] * reward
+                lengths[job] += 1
+                if dones[index]:
+                    start_next(index)
+    return returns, discounted, lengths
+
+
+@dataclass
+class _Probe:
+    name: str
+    n_objectives: int
+    deterministic: bool
+
+
+def _probe(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict[str, Any] | None) -> _Probe:
+    """What must be known of an environment before it is copied."""
+    if isinstance(env, VecEnv):
+        check_vec_env(env)
+        spec = env.get_attr("spec", indices=[0])[0]
+        deterministic = env.has_attr("deterministic") and all(env.get_attr("deterministic"))
+        return _Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic))
+    one = wrap_env(make_env(env, env_kwargs))
+    try:
+        name = one.spec.id if one.spec is not None else type(one.unwrapped).__name__
+        deterministic = one.has_wrapper_attr("deterministic") and one.get_wrapper_attr("deterministic")
+        return _Probe(name, one.get_wrapper_attr("n_objectives"), bool(deterministic))
+    finally:
+        if one.unwrapped is not getattr(env, "unwrapped", None):
+            one.close()
+
+
+def _make_vec_env(
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env], n_envs: int, env_kwargs: dict[str, Any] | None
+) -> tuple[VecEnv, bool]:
+    """A VecEnv, and whether it is ours to close."""
+    if isinstance(env, VecEnv):
+        return env, False
+    if isinstance(env, gym.Env):
+        return DummyVecEnv([lambda: wrap_env(env)]), False
+    return make_mo_vec_env(env, n_envs, env_kwargs=env_kwargs), True

@@ -1,0 +1,86 @@
+"""Quality of a set of value vectors (section 4.1.2). All returns are maximised.
+
+Shapes: `values` is (n_solutions, n_objectives), `preferences` is (n_preferences, n_objectives).
+"""
+
+import moocore
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def as_points(values: ArrayLike, name: str = "values") -> Array:
+    """Value vectors as a finite float64 (n, n_objectives) array.
+
+    :raises ValueError: naming the array and its shape
+    """
+    points = np.asarray(values, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] == 0:
+        raise ValueError(f"{name} has shape {points.shape}: give (n, n_objectives).")
+    if not np.isfinite(points).all():
+        raise ValueError(f"{name} has an entry that is not finite.")
+    return points
+
+
+def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
+    """HV, eq. (4.1): the volume between the reference point and what the values dominate, in the product of their units.
+
+    :param reference_point: (n_objectives,); values that are not above it in every objective count for nothing
+    """
+    points = as_points(values)
+    reference = np.asarray(reference_point, dtype=np.float64)
+    if reference.shape != (points.shape[1],):
+        raise ValueError(f"The reference point {reference_point!r} has shape {reference.shape}, not ({points.shape[1]},).")
+    points = points[(points > reference).all(axis=1)]
+    if len(points) == 0:
+        return 0.0
+    if points.shape[1] == 1:
+        return float(points.max() - reference[0])
+    return float(moocore.hypervolume(points, ref=reference, maximise=True))
+
+
+def expected_utility(values: ArrayLike, preferences: ArrayLike) -> float:
+    """EUM, eq. (4.2): the mean over preferences w of max_i w . V_i, in the unit of the scalarised return."""
+    return float(_utilities(values, preferences).max(axis=1).mean())
+
+
+def preference_regret(values: ArrayLike, preferences: ArrayLike) -> float:
+    """The mean over w of max_i w . V_i - w . V_w: what a user loses who asks for w, because the policy answers another
+    preference better. EUM hides it.
+
+    :param values: V_w for each preference, in their order, (n_preferences, n_objectives)
+    """
+    utilities = _utilities(values, preferences)
+    if utilities.shape[0] != utilities.shape[1]:
+        raise ValueError(f"{utilities.shape[1]} values for {utilities.shape[0]} preferences: give one value per preference.")
+    return float((utilities.max(axis=1) - utilities.diagonal()).mean())
+
+
+def inverted_generational_distance(values: ArrayLike, reference_front: ArrayLike) -> float:
+    """IGD, eq. (4.3): the mean distance from each point of a reference front to the nearest value.
+
+    Objectives of different units should be normalised first (section 4.4: the front's range to [0, 1]).
+    """
+    points, front = as_points(values), as_points(reference_front, "reference_front")
+    if points.shape[1] != front.shape[1]:
+        raise ValueError(f"values have {points.shape[1]} objectives, the reference front {front.shape[1]}.")
+    return float(moocore.igd(points, ref=front, maximise=True))
+
+
+def non_dominated(values: ArrayLike) -> NDArray[np.bool_]:
+    """Which values no other value exceeds in one objective without falling behind in another, (n,); of equal ones the first."""
+    points = as_points(values)
+    if points.shape[1] == 1:
+        mask = np.zeros(len(points), dtype=bool)
+        mask[points[:, 0].argmax()] = True
+        return mask
+    return np.asarray(moocore.is_nondominated(points, maximise=True, keep_weakly=False), dtype=bool)
+
+
+def _utilities(values: ArrayLike, preferences: ArrayLike) -> Array:
+    """w . V for each preference and value, (n_preferences, n_solutions)."""
+    points, w = as_points(values), as_points(preferences, "preferences")
+    if points.shape[1] != w.shape[1]:
+        raise ValueError(f"values have {points.shape[1]} objectives, preferences {w.shape[1]}.")
+    return w @ points.T

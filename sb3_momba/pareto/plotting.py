@@ -1,0 +1,71 @@
+"""Pictures of Pareto fronts."""
+
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from sb3_momba.files import atomic_write
+from sb3_momba.pareto.evaluation import ParetoFront
+from sb3_momba.pareto.metrics import as_points, non_dominated
+
+# Okabe & Ito (2008): told apart by the colour-blind.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+Fronts = ParetoFront | ArrayLike | Mapping[str, "ParetoFront | ArrayLike"]
+
+
+def plot_front(
+    fronts: Fronts,
+    path: str | os.PathLike[str] | None = None,
+    objectives: Sequence[str] | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw solution sets of two or three objectives; dominated solutions are faint.
+
+    :param fronts: a ParetoFront, its values (n, n_objectives), or several of them under the names of the legend
+    :param path: where to write the picture; its suffix chooses the format
+    :param objectives: the axes' labels
+    :raises ValueError: for another number of objectives, or fronts that differ in it
+    """
+    named = dict(fronts) if isinstance(fronts, Mapping) else {"": fronts}
+    points = {name: front.values if isinstance(front, ParetoFront) else as_points(front) for name, front in named.items()}
+    widths = {name: p.shape[1] for name, p in points.items()}
+    if len(set(widths.values())) != 1 or next(iter(widths.values())) not in (2, 3):
+        raise ValueError(f"plot_front draws fronts of 2 or of 3 objectives, not {widths}.")
+    n_objectives = next(iter(widths.values()))
+    labels = list(objectives) if objectives is not None else [f"Objective {i + 1}" for i in range(n_objectives)]
+    if len(labels) != n_objectives:
+        raise ValueError(f"objectives={labels}: {n_objectives} labels are needed.")
+
+    # A Figure of its own, not pyplot's: nothing is kept alive, and no display is needed.
+    figure = Figure(figsize=(6, 4.5), layout="constrained")
+    axes = figure.add_subplot(projection="3d" if n_objectives == 3 else None)
+    for i, (name, p) in enumerate(points.items()):
+        _scatter(axes, p, name, COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
+    axes.set(xlabel=labels[0], ylabel=labels[1], title=title or "")
+    if n_objectives == 3:
+        axes.set_zlabel(labels[2])  # type: ignore[attr-defined]
+    else:
+        axes.grid(alpha=0.3)
+    if any(points):
+        axes.legend()
+    if path is not None:
+        path = os.fspath(path)
+        with atomic_write(path) as file:
+            figure.savefig(file, dpi=150, format=os.path.splitext(path)[1].lstrip(".") or "png")
+    return figure
+
+
+def _scatter(axes: Axes, points: np.ndarray, label: str, colour: str, marker: str) -> None:
+    on_front = non_dominated(points)
+    axes.scatter(*points[~on_front].T, color=colour, marker=marker, s=14, alpha=0.25)  # type: ignore[misc]
+    front = points[on_front]
+    axes.scatter(*front.T, color=colour, marker=marker, s=26, label=label)  # type: ignore[misc]
+    if points.shape[1] == 2:
+        front = front[front[:, 0].argsort()]
+        axes.plot(*front.T, color=colour, linewidth=1, alpha=0.6)

@@ -1,0 +1,210 @@
+"""Train from the command line: `python -m sb3_momba.train --env mo-hopper-2obj-v5 --steps 1e6`.
+
+The variants of the thesis carry the names of its Table A.1. Each run has a folder of its own: the configuration, the
+models, the evaluations, the front's picture, and logs as CSV and for TensorBoard.
+"""
+
+import argparse
+import inspect
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_momba.envs.wrappers import make_mo_vec_env
+from sb3_momba.files import atomic_write
+from sb3_momba.momba import MOMBA
+from sb3_momba.pareto.callbacks import ParetoEvalCallback
+from sb3_momba.pareto.evaluation import ParetoFront
+from sb3_momba.saving import library_versions
+
+ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
+NOT_HYPERPARAMETERS = {"self", "policy", "env", "seed", "tensorboard_log", "verbose", "_init_setup_model"}
+
+
+@dataclass
+class RunSettings:
+    """One training run.
+
+    :param hyperparameters: MOMBA's arguments
+    :param output: the run's folder; must not hold a run already
+    :param eval_freq: environment steps between evaluations
+    """
+
+    env: str
+    output: str
+    steps: int = 1_000_000
+    seed: int = 0
+    policy: str = "SimbaPolicy"
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    n_envs: int = 1
+    subprocesses: bool = False
+    eval_freq: int = 50_000
+    n_preferences: int = 100
+    n_episodes: int = 5
+    reference_point: list[float] | None = None
+    objectives: list[str] | None = None
+    device: str = "auto"
+    progress_bar: bool = True
+
+
+@dataclass
+class RunResult:
+    """What a run left: its front, its hypervolumes over time and its folder."""
+
+    front: ParetoFront
+    timesteps: list[int]
+    metrics: list[dict[str, float]]
+    folder: Path
+
+
+def run(settings: RunSettings) -> RunResult:
+    """Train, evaluate and write the run's folder."""
+    check_hyperparameters(settings.hyperparameters)
+    folder = Path(settings.output)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
+    vec_env_cls = SubprocVecEnv if settings.subprocesses else DummyVecEnv
+    env = make_mo_vec_env(settings.env, settings.n_envs, vec_env_cls=vec_env_cls)
+    try:
+        model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
+        config = {**asdict(settings), "command": " ".join(sys.argv), "versions": library_versions()}
+        with atomic_write(folder / "config.json") as file:
+            file.write(json.dumps(config, indent=2).encode())
+        model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
+        evaluation = ParetoEvalCallback(
+            settings.env,
+            eval_freq=settings.eval_freq,
+            n_preferences=settings.n_preferences,
+            n_episodes=settings.n_episodes,
+            reference_point=settings.reference_point,
+            objectives=settings.objectives,
+            log_path=folder,
+            best_model_save_path=folder,
+        )
+        model.learn(settings.steps, callback=evaluation, progress_bar=settings.progress_bar)
+        model.save(folder / "model.zip")
+    finally:
+        env.close()
+    assert evaluation.front is not None
+    return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, folder)
+
+
+def check_hyperparameters(hyperparameters: dict[str, Any]) -> None:
+    """:raises ValueError: for a name that MOMBA does not take, with the nearest that it does"""
+    known = set(inspect.signature(MOMBA.__init__).parameters) - NOT_HYPERPARAMETERS
+    for name in hyperparameters:
+        if name not in known:
+            near = get_close_matches(name, known, 1)
+            raise ValueError(f"MOMBA has no hyperparameter {name!r}" + (f": did you mean {near[0]!r}?" if near else "."))
+
+
+def report(result: RunResult) -> str:
+    """A run's hypervolume over time and where its picture is, as text."""
+    columns = ("steps", "hypervolume", "expected utility", "preference regret")
+    lines = ["  ".join(f"{column:>17}" for column in columns)]
+    for step, m in zip(result.timesteps, result.metrics, strict=True):
+        lines.append(
+            f"{step:>17,}  {m['hypervolume']:>17,.6g}  {m['expected_utility']:>17,.5g}  {m['preference_regret']:>17,.4g}"
+        )
+    picture = result.folder / "front.png"
+    lines.append(f"Run folder: {result.folder}" + (f"   Picture of the front: {picture}" if picture.exists() else ""))
+    return "\n".join(lines)
+
+
+def parse(arguments: Sequence[str] | None = None) -> RunSettings:
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_momba.train", description="Train MOMBA and evaluate its Pareto front.", allow_abbrev=False
+    )
+    parser.add_argument("--env", required=True, help="environment id")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=lambda text: int(float(text)), default=1_000_000, help="environment steps")
+    parser.add_argument("--output", help="folder of the run; by default runs/ENV/TIME-SEED")
+
+    variant = parser.add_argument_group("variants (Table A.1)")
+    variant.add_argument("--architecture", choices=ARCHITECTURES, default="simba")
+    variant.add_argument("--critic-loss", choices=("ce", "mse"), default="ce")
+    variant.add_argument("--vector-values", action="store_true", help="vector critic (3.2.2) instead of the scalarised one")
+    variant.add_argument("--her", action="store_true", help="hindsight relabelling of preferences (3.20)")
+    variant.add_argument("--preference-alignment-regularization", action="store_true", help="(3.21); needs --vector-values")
+    variant.add_argument("--ent-coef", help='"auto_0.2" (default), "auto_0.01" for runs below 200,000 steps, or a number')
+    variant.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="any argument of MOMBA, such as batch_size=128 or policy_kwargs.actor_blocks=1; may be repeated",
+    )
+
+    machine = parser.add_argument_group("running")
+    machine.add_argument("--n-envs", type=int, default=1, help="environments side by side")
+    machine.add_argument("--subprocesses", action="store_true", help="each in a process of its own")
+    machine.add_argument("--device", default="auto")
+    machine.add_argument("--no-progress-bar", action="store_true")
+
+    evaluation = parser.add_argument_group("evaluation")
+    evaluation.add_argument("--eval-freq", type=lambda text: int(float(text)), default=50_000, help="environment steps")
+    evaluation.add_argument("--n-preferences", type=int, default=100)
+    evaluation.add_argument("--n-episodes", type=int, default=5, help="per preference")
+    evaluation.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume; 0 by default")
+    evaluation.add_argument("--objectives", nargs="+", help="names for the picture's axes")
+
+    given = parser.parse_args(arguments)
+    hyperparameters: dict[str, Any] = {"critic_loss": given.critic_loss}
+    for option, name in (("vector_values", "vector_values"), ("her", "her")):
+        if getattr(given, option):
+            hyperparameters[name] = True
+    if given.preference_alignment_regularization:
+        hyperparameters["preference_alignment"] = True
+    if given.ent_coef is not None:
+        hyperparameters["ent_coef"] = given.ent_coef
+    for assignment in given.set:
+        assign(hyperparameters, assignment)
+    return RunSettings(
+        env=given.env,
+        output=given.output or f"runs/{given.env}/{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
+        steps=given.steps,
+        seed=given.seed,
+        policy=ARCHITECTURES[given.architecture],
+        hyperparameters=hyperparameters,
+        n_envs=given.n_envs,
+        subprocesses=given.subprocesses,
+        eval_freq=given.eval_freq,
+        n_preferences=given.n_preferences,
+        n_episodes=given.n_episodes,
+        reference_point=given.reference_point,
+        objectives=given.objectives,
+        device=given.device,
+        progress_bar=not given.no_progress_bar,
+    )
+
+
+def assign(hyperparameters: dict[str, Any], assignment: str) -> None:
+    """Put "name=value" or "name.key=value" into a dictionary; the value is a yaml literal, never evaluated."""
+    name, separator, text = assignment.partition("=")
+    if not separator or not name:
+        raise ValueError(f"--set {assignment}: write NAME=VALUE.")
+    *parents, key = name.split(".")
+    for parent in parents:
+        hyperparameters = hyperparameters.setdefault(parent, {})
+    hyperparameters[key] = yaml.safe_load(text)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    try:
+        result = run(parse(arguments))
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    print(report(result))
+
+
+if __name__ == "__main__":
+    main()
