@@ -17,7 +17,7 @@ setup(
     license="MIT",
     license_files=["LICENSE"],
     packages=find_packages(include=["sb3_momba", "sb3_momba.*"]),
-    package_data={"sb3_momba": ["py.typed", "envs/riesz_100.npz", "hyperparams/*.yml"]},
+    package_data={"sb3_momba": ["py.typed", "envs/riesz_100.npz", "zoo/hyperparams/*.yml"]},
     python_requires=">=3.10",
     install_requires=[
         "stable-baselines3>=2.9,<3",
@@ -31,10 +31,11 @@ setup(
         "tqdm>=4.66",
         "rich>=13",
         "pyyaml>=6",
+        "psutil>=5.9",
     ],
     extras_require={
         "baselines": ["morl-baselines>=1.3"],
-        "test": ["pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.100", "ruff>=0.15", "mypy>=1.15", "types-PyYAML"],
+        "test": ["sb3-momba[baselines]", "pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.100", "ruff>=0.15", "mypy>=1.15", "types-PyYAML", "types-psutil"],
     },
     classifiers=[
         "Intended Audience :: Science/Research",

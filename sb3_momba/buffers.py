@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+import psutil
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -73,6 +74,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self.preference_dim = preference_dim(n_objectives)
         raw_dim = observation_space.shape[0] - self.preference_dim
         raw_space = spaces.Box(observation_space.low[:raw_dim], observation_space.high[:raw_dim], dtype=np.float32)
+        _check_memory(buffer_size, numbers=2 * raw_dim + action_space.shape[0] + 2 * n_objectives + 3)
         super().__init__(buffer_size, raw_space, action_space, device, n_envs)
         self.rewards = np.zeros((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.preferences = np.ones((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
@@ -105,9 +107,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
         """
         vector_rewards = self._vector_rewards(reward, infos)
         if not np.isfinite(next_obs).all():
-            raise ValueError(
-                f"Environment {int((~np.isfinite(next_obs)).any(axis=1).argmax())}: a number of {next_obs} is not finite."
-            )
+            index = int((~np.isfinite(next_obs)).any(axis=1).argmax())
+            raise ValueError(f"Environment {index}: the observation {next_obs[index]} has a number that is not finite.")
         raw = self.observation_dim
         if self.preference_dim > 0:
             self.preferences[self.pos] = obs[:, raw:]
@@ -217,3 +218,16 @@ class PreferenceReplayBuffer(ReplayBuffer):
         total = relabelled.sum(axis=1, keepdims=True)
         keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None] | (total == 0)
         return np.where(keep, preferences, relabelled / np.where(total == 0, 1, total)).astype(np.float32)
+
+
+def _check_memory(buffer_size: int, numbers: int) -> None:
+    """
+    :param numbers: float32 numbers per transition
+    :raises MemoryError: if the buffer cannot fit into this machine's memory once it is full
+    """
+    needed, available = 4 * numbers * buffer_size, psutil.virtual_memory().available
+    if needed > available:
+        raise MemoryError(
+            f"A replay buffer of buffer_size={buffer_size:,} transitions grows to {needed / 1e9:.1f} GB, and "
+            f"{available / 1e9:.1f} GB are free: choose buffer_size={int(0.8 * available / needed * buffer_size):,} or less."
+        )

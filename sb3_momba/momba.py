@@ -13,12 +13,11 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
-from sb3_momba.envs.preferences import PreferenceSampler, check_preference, preference_dim
+from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
@@ -26,6 +25,12 @@ from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 from sb3_momba.saving import PickleFreeSaving
 
 BLIND_UPDATES = 1_000
+MAX_SKIPPED_UPDATES = 20
+CHOICES = {
+    "critic_loss": ("ce", "mse"),
+    "critic_minimum": ("scalarised", "objective"),
+    "critic_loss_reduction": ("sum", "mean"),
+}
 
 Metrics = dict[str, th.Tensor]
 Self = TypeVar("Self", bound="MOMBA")
@@ -60,7 +65,11 @@ class MOMBA(PickleFreeSaving):
     :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
     :param target_entropy: of the policy on [-1, 1], in nats; "auto": -|A|
     :param preference_sampler: `rng -> (n_objectives,)` for all environments; None leaves them theirs, by default uniform
-        on the simplex once an episode
+        on the simplex once an episode; or a literal as `make_sampler` takes it
+    :param critic_minimum: "scalarised": the critic whose w.Q is lower (section 3.4.2); "objective": the lower Q of each
+        objective apart (CAPQL)
+    :param critic_loss_reduction: over critics and objectives: "sum" (3.17) or "mean" (CAPQL)
+    :param deterministic_exploration: collect data with the mean action (CAPQL's code) instead of a sample
     :param replay_buffer_class: PreferenceReplayBuffer or a subclass
     :param policy_kwargs: see SimbaPolicy, MlpPolicy and MombaPolicy
     :raises ValueError: for settings or environments that do not go together, naming them
@@ -94,7 +103,10 @@ class MOMBA(PickleFreeSaving):
         best_return_scale: float | None = 3.0,
         ent_coef: str | float = "auto_0.2",
         target_entropy: str | float = "auto",
-        preference_sampler: PreferenceSampler | None = None,
+        preference_sampler: PreferenceSampler | SamplerSpec | None = None,
+        critic_minimum: str = "scalarised",
+        critic_loss_reduction: str = "sum",
+        deterministic_exploration: bool = False,
         replay_buffer_class: type[PreferenceReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
@@ -139,6 +151,9 @@ class MOMBA(PickleFreeSaving):
         self.her = her
         self.her_kwargs = her_kwargs
         self.preference_alignment = preference_alignment
+        self.critic_minimum = critic_minimum
+        self.critic_loss_reduction = critic_loss_reduction
+        self.deterministic_exploration = deterministic_exploration
         self.best_return_scale = best_return_scale
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
@@ -167,16 +182,31 @@ class MOMBA(PickleFreeSaving):
             **{**self._injected_policy_kwargs(), **self.policy_kwargs},
         ).to(self.device)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        self._convert_train_freq()
         self._setup_entropy_coefficient()
         self._blind_updates = th.zeros((), device=self.device)
         self._warned_blind = False
+        self._skipped_updates = 0
 
     def _check_settings(self) -> None:
+        """
+        :raises ValueError: for options that do not go together, saying why
+        """
+        self._convert_train_freq()
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
+            raise ValueError(
+                f"train_freq={self.train_freq.frequency} episodes with n_envs={self.n_envs}: episodes end at different times; "
+                "count steps, or use one environment."
+            )
         if self.preference_alignment and not self.vector_values:
             raise ValueError("preference_alignment=True needs the vector Q of eq. (3.21): set vector_values=True.")
+        if self.n_objectives == 1 and (self.her or self.preference_alignment):
+            raise ValueError("her and preference_alignment need two objectives or more: with one there is no preference.")
         if self.her_kwargs is not None and not self.her:
             raise ValueError(f"her_kwargs={self.her_kwargs} without her=True: set her=True, or leave them out.")
+        for name, known in CHOICES.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}={getattr(self, name)!r} is not known: use one of {', '.join(known)}.")
         if not issubclass(self.replay_buffer_class or PreferenceReplayBuffer, PreferenceReplayBuffer):
             raise ValueError(
                 f"replay_buffer_class={self.replay_buffer_class}: it must be PreferenceReplayBuffer or a subclass, which "
@@ -251,7 +281,7 @@ class MOMBA(PickleFreeSaving):
         if n_objectives_of(env) != self.n_objectives:
             raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(env)}.")
         if self.preference_sampler is not None:
-            env.env_method("set_preference_sampler", self.preference_sampler)
+            env.env_method("set_preference_sampler", make_sampler(self.preference_sampler, self.n_objectives))
         if self.n_objectives == 1:
             logger.warning("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
 
@@ -310,6 +340,16 @@ class MOMBA(PickleFreeSaving):
         w = np.broadcast_to(w, (*observation.shape[:-1], self.n_objectives))
         return np.concatenate([observation, w], axis=-1, dtype=np.float32)
 
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's is asked for."""
+        if not self.deterministic_exploration or self.num_timesteps < learning_starts:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        assert isinstance(self._last_obs, np.ndarray)
+        action, _ = self.predict(self._last_obs, deterministic=True)
+        return action, self.policy.scale_action(action)
+
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -351,18 +391,35 @@ class MOMBA(PickleFreeSaving):
         self._update_learning_rate(optimizers)
 
         for _ in range(gradient_steps):
-            batch = self._sample(batch_size)
-            alpha = self.alpha
-            critic_loss, critic_metrics = self._critic_loss(batch, alpha)
-            descend(self.critic.optimizer, critic_loss)
-            actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
-            descend(self.actor.optimizer, actor_loss)
-            if self.ent_coef_optimizer is not None:
-                descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
-            self.policy.project_weights()
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            self._n_updates += 1
-            self._note({**critic_metrics, **actor_metrics, "ent_coef": alpha})
+            try:
+                self._gradient_step(self._sample(batch_size))
+                self._skipped_updates = 0
+            except NonFiniteLossError as error:
+                self._skip_update(error)
+
+    def _gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
+        """One pass through the inner loop of Algorithm 1."""
+        alpha = self.alpha
+        critic_loss, critic_metrics = self._critic_loss(batch, alpha)
+        descend(self.critic.optimizer, critic_loss)
+        actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
+        descend(self.actor.optimizer, actor_loss)
+        if self.ent_coef_optimizer is not None:
+            descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
+        self.policy.project_weights()
+        move_towards(self.critic_target, self.critic, self.tau)
+        self._n_updates += 1
+        self._note({**critic_metrics, **actor_metrics, "ent_coef": alpha})
+
+    def _skip_update(self, error: "NonFiniteLossError") -> None:
+        """Go on after one bad loss; give up, with the parameters of the last good one, after many in a row."""
+        self._skipped_updates += 1
+        if self._skipped_updates >= MAX_SKIPPED_UPDATES:
+            raise NonFiniteLossError(
+                f"{self._skipped_updates} updates in a row had a loss that is not finite: the training diverges. Parameters "
+                f"are those before the first of them. Lower learning_rate={self.learning_rate}, or check the rewards."
+            ) from error
+        logger.warning("Update %d is skipped: %s", self._n_updates + 1, error)
 
     def _sample(self, batch_size: int) -> PreferenceReplayBufferSamples:
         """A minibatch, normalised with the statistics of this moment."""
@@ -384,10 +441,14 @@ class MOMBA(PickleFreeSaving):
                 discounts=batch.discounts * (1 - batch.dones),
                 bonus=-alpha * next_log_prob,
             )
-            target = lowest(targets, self._scalarised(value.target_mean(targets), batch.preferences))
+            worth = value.target_mean(targets)
+            if self.critic_minimum == "scalarised":
+                worth = self._scalarised(worth, batch.preferences)[..., None]
+            target = lowest(targets, worth)
         features = self.critic.features(batch.observations, batch.actions)
         outputs = self.critic.values(features)
-        loss = value.loss(outputs, target).sum(dim=(1, 2)).mean()
+        loss = value.loss(outputs, target)
+        loss = loss.sum(dim=(1, 2)).mean() if self.critic_loss_reduction == "sum" else loss.mean()
         with th.no_grad():
             metrics = {
                 "critic_loss": loss.detach(),
@@ -401,6 +462,8 @@ class MOMBA(PickleFreeSaving):
         """Eq. (3.18), with eq. (3.21)'s alignment if it is on. Also returns log pi(a | s, w), (batch,)."""
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         q_vector = self.policy.value.mean(self.critic(batch.observations, actions))
+        if self.critic_minimum == "objective":
+            q_vector = q_vector.amin(dim=1, keepdim=True)
         q = self._scalarised(q_vector, batch.preferences)
         if self.preference_alignment:
             q = q * th.cosine_similarity(q_vector, batch.preferences[:, None], dim=-1)
@@ -488,8 +551,20 @@ def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
     return (preferences * values).sum(dim=-1)
 
 
+@th.no_grad()
+def move_towards(target: th.nn.Module, network: th.nn.Module, tau: float) -> None:
+    """target <- (1 - tau) target + tau network, all parameters in one call (Algorithm 1)."""
+    th._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+
+
+class NonFiniteLossError(ArithmeticError):
+    """A loss is NaN or infinite; nothing was changed by it."""
+
+
 def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
     """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
+    if not th.isfinite(loss):
+        raise NonFiniteLossError(f"its loss is {float(loss)}.")
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     optimizer.zero_grad(set_to_none=True)
     loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]

@@ -14,8 +14,6 @@ from sb3_momba.nn.networks import Actor, Architecture, Critic, MlpArchitecture, 
 from sb3_momba.nn.normalization import ReturnScale, RunningStatistics
 from sb3_momba.nn.values import DistributionalValue, ExpectedValue
 
-CRITIC_LOSSES = ("ce", "mse")
-
 
 class MombaPolicy(BasePolicy):
     """What both policies share; a subclass chooses the architectures of actor and critic.
@@ -27,6 +25,8 @@ class MombaPolicy(BasePolicy):
     :param n_atoms: atoms of a return distribution (critic_loss="ce")
     :param support: first and last atom, in scaled returns
     :param normalize_observations: by their running mean and deviation
+    :param capql_log_prob: log pi as CAPQL's code has it: of the action within the environment's bounds, with 1e-6 inside
+        the logarithm, clamped to [-1000, 1000]
     """
 
     action_space: spaces.Box
@@ -49,6 +49,7 @@ class MombaPolicy(BasePolicy):
         support: tuple[float, float] = (-5.0, 5.0),
         normalize_observations: bool = True,
         normalize_weights: bool = True,
+        capql_log_prob: bool = False,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
@@ -59,8 +60,6 @@ class MombaPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=True,
         )
-        if critic_loss not in CRITIC_LOSSES:
-            raise ValueError(f"critic_loss={critic_loss!r} is not known: use one of {', '.join(CRITIC_LOSSES)}.")
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics}: at least one critic is needed.")
         if n_atoms < 2 or not support[0] < support[1]:
@@ -76,6 +75,9 @@ class MombaPolicy(BasePolicy):
         self.value = DistributionalValue(*support, n_atoms) if critic_loss == "ce" else ExpectedValue()
         action_dim = int(action_space.shape[0])
         self.actor = Actor(actor_architecture, self.observation_dim, self.preference_dim, action_dim)
+        if capql_log_prob:
+            scale = th.as_tensor((action_space.high - action_space.low) / 2, dtype=th.float32)
+            self.actor.register_buffer("action_scale", scale)
         self.critic = Critic(
             critic_architecture,
             self.observation_dim,
@@ -87,11 +89,13 @@ class MombaPolicy(BasePolicy):
         )
         self.project_weights()
         self.critic_target = deepcopy(self.critic).requires_grad_(False)
+        # Fused: one pass over the parameters instead of a dozen.
+        fused = {"fused": True} if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) else {}
         for network in (self.actor, self.critic):
             network.optimizer = self.optimizer_class(
                 network.parameters(),
                 lr=lr_schedule(1),  # type: ignore[call-arg]
-                **self.optimizer_kwargs,
+                **{**fused, **self.optimizer_kwargs},
             )
 
     def normalize(self, observations: th.Tensor) -> th.Tensor:
@@ -158,6 +162,7 @@ class MlpPolicy(MombaPolicy):
 
     :param net_arch: widths of the hidden layers, or `dict(pi=[...], qf=[...])` for actor and critics apart
     :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)
+    :param ortho_init: orthogonal weights and zero biases at the start, as in CAPQL's code, instead of torch's own
     :param kwargs: see MombaPolicy
     """
 
@@ -168,6 +173,7 @@ class MlpPolicy(MombaPolicy):
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         conditioning: str = "input",
+        ortho_init: bool = False,
         **kwargs: Any,
     ):
         if net_arch is None:
@@ -179,8 +185,8 @@ class MlpPolicy(MombaPolicy):
             observation_space,
             action_space,
             lr_schedule,
-            MlpArchitecture(arch["pi"], conditioning),
-            MlpArchitecture(arch["qf"], conditioning),
+            MlpArchitecture(arch["pi"], conditioning, ortho_init),
+            MlpArchitecture(arch["qf"], conditioning, ortho_init),
             normalize_weights=False,
             **kwargs,
         )

@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict, TrainFreq,
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_momba.buffers import PreferenceReplayBuffer
-from sb3_momba.envs.preferences import FixedSampler, PerStepSampler, UniformSampler
+from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.files import FileFormatError, FilePath, read_tree, register, write_tree
 from sb3_momba.policies import MombaPolicy
@@ -285,7 +285,7 @@ def _register_simple(cls: type, names: tuple[str, ...]) -> None:
 
 
 _register_box()
-for _sampler in (UniformSampler, FixedSampler, PerStepSampler):
+for _sampler in (UniformSampler, ConeSampler, FixedSampler, PerStepSampler):
     _register_simple(_sampler, tuple(field.name for field in fields(_sampler)))
 register(TrainFreq, lambda x: [x.frequency, x.unit.value], lambda tree: TrainFreq(tree[0], TrainFrequencyUnit(tree[1])))
 _register_simple(ConstantSchedule, ("val",))

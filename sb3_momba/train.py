@@ -5,13 +5,11 @@ models, the evaluations, the front's picture, and logs as CSV and for TensorBoar
 """
 
 import argparse
-import inspect
 import json
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +23,9 @@ from sb3_momba.momba import MOMBA
 from sb3_momba.pareto.callbacks import ParetoEvalCallback
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.saving import library_versions
+from sb3_momba.zoo.configuration import Configuration, check_hyperparameters, read_configuration, shipped_configurations
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
-NOT_HYPERPARAMETERS = {"self", "policy", "env", "seed", "tensorboard_log", "verbose", "_init_setup_model"}
 
 
 @dataclass
@@ -68,7 +66,7 @@ class RunResult:
 
 def run(settings: RunSettings) -> RunResult:
     """Train, evaluate and write the run's folder."""
-    check_hyperparameters(settings.hyperparameters)
+    check_hyperparameters(settings.policy, settings.hyperparameters)
     folder = Path(settings.output)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
@@ -98,15 +96,6 @@ def run(settings: RunSettings) -> RunResult:
     return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, folder)
 
 
-def check_hyperparameters(hyperparameters: dict[str, Any]) -> None:
-    """:raises ValueError: for a name that MOMBA does not take, with the nearest that it does"""
-    known = set(inspect.signature(MOMBA.__init__).parameters) - NOT_HYPERPARAMETERS
-    for name in hyperparameters:
-        if name not in known:
-            near = get_close_matches(name, known, 1)
-            raise ValueError(f"MOMBA has no hyperparameter {name!r}" + (f": did you mean {near[0]!r}?" if near else "."))
-
-
 def report(result: RunResult) -> str:
     """A run's hypervolume over time and where its picture is, as text."""
     columns = ("steps", "hypervolume", "expected utility", "preference regret")
@@ -126,12 +115,17 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     )
     parser.add_argument("--env", required=True, help="environment id")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=lambda text: int(float(text)), default=1_000_000, help="environment steps")
+    parser.add_argument(
+        "--steps", type=lambda text: int(float(text)), help="environment steps; by default the configuration's, or 1e6"
+    )
+    parser.add_argument(
+        "--conf", help=f"yaml file in rl_zoo3's format, or one of the shipped: {', '.join(shipped_configurations())}"
+    )
     parser.add_argument("--output", help="folder of the run; by default runs/ENV/TIME-SEED")
 
     variant = parser.add_argument_group("variants (Table A.1)")
-    variant.add_argument("--architecture", choices=ARCHITECTURES, default="simba")
-    variant.add_argument("--critic-loss", choices=("ce", "mse"), default="ce")
+    variant.add_argument("--architecture", choices=ARCHITECTURES, help="simba by default")
+    variant.add_argument("--critic-loss", choices=("ce", "mse"), help="ce by default")
     variant.add_argument("--vector-values", action="store_true", help="vector critic (3.2.2) instead of the scalarised one")
     variant.add_argument("--her", action="store_true", help="hindsight relabelling of preferences (3.20)")
     variant.add_argument("--preference-alignment-regularization", action="store_true", help="(3.21); needs --vector-values")
@@ -145,7 +139,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     )
 
     machine = parser.add_argument_group("running")
-    machine.add_argument("--n-envs", type=int, default=1, help="environments side by side")
+    machine.add_argument("--n-envs", type=int, help="environments side by side")
     machine.add_argument("--subprocesses", action="store_true", help="each in a process of its own")
     machine.add_argument("--device", default="auto")
     machine.add_argument("--no-progress-bar", action="store_true")
@@ -158,24 +152,26 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     evaluation.add_argument("--objectives", nargs="+", help="names for the picture's axes")
 
     given = parser.parse_args(arguments)
-    hyperparameters: dict[str, Any] = {"critic_loss": given.critic_loss}
-    for option, name in (("vector_values", "vector_values"), ("her", "her")):
-        if getattr(given, option):
-            hyperparameters[name] = True
-    if given.preference_alignment_regularization:
-        hyperparameters["preference_alignment"] = True
-    if given.ent_coef is not None:
-        hyperparameters["ent_coef"] = given.ent_coef
+    configuration = read_configuration(given.conf, given.env) if given.conf else Configuration("SimbaPolicy", {})
+    hyperparameters = configuration.hyperparameters
+    options = {
+        "critic_loss": given.critic_loss,
+        "vector_values": given.vector_values or None,
+        "her": given.her or None,
+        "preference_alignment": given.preference_alignment_regularization or None,
+        "ent_coef": given.ent_coef,
+    }
+    hyperparameters.update({name: value for name, value in options.items() if value is not None})
     for assignment in given.set:
         assign(hyperparameters, assignment)
     return RunSettings(
         env=given.env,
         output=given.output or f"runs/{given.env}/{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
-        steps=given.steps,
+        steps=given.steps or configuration.n_timesteps or 1_000_000,
         seed=given.seed,
-        policy=ARCHITECTURES[given.architecture],
+        policy=ARCHITECTURES[given.architecture] if given.architecture else configuration.policy,
         hyperparameters=hyperparameters,
-        n_envs=given.n_envs,
+        n_envs=given.n_envs or configuration.n_envs,
         subprocesses=given.subprocesses,
         eval_freq=given.eval_freq,
         n_preferences=given.n_preferences,

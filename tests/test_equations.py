@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
@@ -70,7 +70,7 @@ def make_model(env: gym.Env | DummyVecEnv | None = None, policy: str = "MlpPolic
     kwargs["policy_kwargs"] = {**small, **kwargs.get("policy_kwargs", {})}
     defaults = {"buffer_size": 1000, "learning_starts": 10**6, "best_return_scale": None, "seed": 0, "device": "cpu"}
     model = MOMBA(policy, CountingEnv() if env is None else env, **{**defaults, **kwargs})
-    model.set_logger(configure(format_strings=[]))
+    model.set_logger(Logger(folder=None, output_formats=[]))
     return model
 
 
@@ -498,6 +498,34 @@ def test_the_order_of_objectives_does_not_matter(seed: int, order: list[int], va
     assert critic_after == pytest.approx(critic_before, rel=1e-4)
     assert actor_after == pytest.approx(actor_before, rel=1e-4, abs=1e-5)
     th.testing.assert_close(target_after, target_before[:, order] if vector else target_before, rtol=1e-4, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------ what CAPQL's code does otherwise
+
+
+def test_capql_takes_the_minimum_of_each_objective_and_the_mean_of_the_losses() -> None:
+    """Critics that expect (1, 4) and (2, 1) have the target (1, 1), with which outputs of 0 and 2 have a squared error of 1
+    each: 4 in sum, 1 in the mean. The actor maximises w.(1, 1) = 1, though the critics' w.Q are 1.3 and 1.9."""
+    model = target_model("mse", vector=True, critic_minimum="objective", critic_loss_reduction="mean")
+    batch = make_batch([[0, 0]], [0.9, 0.1], discounts=1.0)
+    q = th.tensor([[[1.0, 4.0], [2.0, 1.0]]])[..., None]
+    loss, target = critic_loss(model, batch, next_outputs=q, outputs=th.tensor([[[0.0, 2.0], [2.0, 0.0]]])[..., None])
+    assert target.flatten().tolist() == [1, 1]
+    assert loss == 1
+    assert actor_loss(model, batch, q, th.tensor([0.0]), alpha=0.2).item() == pytest.approx(-1)
+
+
+def test_capql_log_prob_is_that_of_the_unscaled_action() -> None:
+    """log N(x; m, s) - log(scale (1 - tanh(x)^2) + 1e-6), where actions reach from -1 to 3 and from 0 to 1."""
+    env = CountingEnv()
+    env.action_space = spaces.Box(np.array([-1, 0], dtype=np.float32), np.array([3, 1], dtype=np.float32))
+    actor = make_model(env, policy_kwargs={"capql_log_prob": True}).actor.double()
+    observations = th.rand(32, 4, dtype=th.float64)
+    actions, log_prob = actor.action_log_prob(observations)
+    mean, log_std = actor.distribution(observations)
+    gaussian = Normal(mean, log_std.exp()).log_prob(actions.atanh())
+    jacobian = th.tensor([2.0, 0.5]) * (1 - actions**2) + 1e-6
+    th.testing.assert_close(log_prob, (gaussian - jacobian.log()).sum(dim=1), rtol=1e-5, atol=1e-5)
 
 
 # ---------------------------------------------------------------------------------------------------------- entropy

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_momba import MOMBA, MlpPolicy, SimbaPolicy
@@ -182,7 +182,7 @@ def test_one_update(
 ) -> None:
     monkeypatch.setattr(model, "_sample", lambda batch_size: batch)
 
-    model.set_logger(configure(format_strings=[]))
+    model.set_logger(Logger(folder=None, output_formats=[]))
     model.train(gradient_steps=1)
 
     after = in_torch_layout(golden, "critic/after_one_adam_step_and_projection", model.critic)

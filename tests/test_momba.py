@@ -396,7 +396,7 @@ def test_the_log_holds_means_since_the_last_log(monkeypatch):
     logs = logs_of(model, 60)
     means = [log["train/critic_loss"] for log in logs if "train/critic_loss" in log]
     # The log of an episode is written before the update that follows its last step.
-    numbers = [float(loss) for loss, _ in losses]
+    numbers = [float(loss.detach()) for loss, _ in losses]
     expected = [np.mean(numbers[:9]), np.mean(numbers[9:19]), np.mean(numbers[19:29]), np.mean(numbers[29:39])]
     np.testing.assert_allclose(means, expected, rtol=1e-5)
 

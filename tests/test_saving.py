@@ -553,6 +553,28 @@ def test_a_class_in_policy_kwargs_comes_back():
     assert again.policy_kwargs == model.policy_kwargs
 
 
+def test_a_class_that_a_subclass_keeps_as_an_attribute_comes_back():
+    model = tiny_model(StubEnv())
+    model.second_optimizer_class = th.optim.SGD
+    assert MOMBA.load(saved(model)).second_optimizer_class is th.optim.SGD
+
+
+@pytest.mark.parametrize("name", ["observation_space", "action_space", "n_objectives"])
+def test_a_model_saved_without_what_it_needs_says_so_at_load(name):
+    file = io.BytesIO()
+    tiny_model(StubEnv()).save(file, exclude=[name])
+    for env in (None, StubEnv()):
+        with pytest.raises(ValueError, match=name):
+            MOMBA.load(file, env=env)
+
+
+def test_a_model_saved_without_what_has_a_default_loads():
+    file = io.BytesIO()
+    tiny_model(StubEnv()).save(file, exclude=["verbose", "tau", "_last_obs", "tensorboard_log"])
+    for env in (None, StubEnv()):
+        assert MOMBA.load(file, env=env).tau == 0.005
+
+
 def test_load_changes_attributes_on_request():
     again = MOMBA.load(saved(tiny_model(StubEnv())), learning_rate=0.5, gamma=0.9, custom_objects={"tau": 0.25})
     assert (again.learning_rate, again.gamma, again.tau) == (0.5, 0.9, 0.25)

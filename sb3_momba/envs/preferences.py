@@ -11,10 +11,12 @@ from functools import lru_cache
 from importlib import resources
 from itertools import combinations
 from math import comb
+from typing import Any
 
 import numpy as np
 
 PreferenceSampler = Callable[[np.random.Generator], np.ndarray]
+SamplerSpec = str | dict[str, Any]
 
 SIMPLEX_TOLERANCE = 1e-5
 
@@ -78,6 +80,54 @@ class PerStepSampler:
 
     def __call__(self, rng: np.random.Generator) -> np.ndarray:
         return self.sampler(rng)
+
+
+@dataclass(frozen=True)
+class ConeSampler:
+    """Preferences within an angle of the simplex's centre, as CAPQL's code draws them: an angle uniform in [0, angle], a
+    direction uniform around the axis (1, ..., 1).
+
+    :param angle: in degrees
+    """
+
+    n_objectives: int
+    angle: float = 22.5
+
+    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+        axis = np.full(self.n_objectives, self.n_objectives**-0.5)
+        direction = rng.standard_normal(self.n_objectives)
+        direction -= (direction @ axis) * axis
+        direction /= np.linalg.norm(direction)
+        w = np.clip(axis + np.tan(np.deg2rad(self.angle) * rng.random()) * direction, 0, None)
+        return w / w.sum()
+
+
+def make_sampler(spec: PreferenceSampler | SamplerSpec, n_objectives: int) -> PreferenceSampler:
+    """A sampler from a literal, as configuration files write it; a callable is returned as it is.
+
+    :param spec: "uniform", "cone", or a dictionary: `name`, for "cone" `angle` in degrees, for "fixed" `preference`, and
+        `per_step` for a new preference after every step
+    :raises ValueError: for anything else
+    """
+    if callable(spec):
+        return spec
+    options: dict[str, Any] = {"name": spec} if isinstance(spec, str) else dict(spec)
+    name, per_step = options.pop("name", None), options.pop("per_step", False)
+    try:
+        if n_objectives == 1:
+            sampler: PreferenceSampler = UniformSampler(1)
+        elif name == "uniform":
+            sampler = UniformSampler(n_objectives, **options)
+        elif name == "cone":
+            sampler = ConeSampler(n_objectives, **options)
+        elif name == "fixed":
+            w = check_preference(options.pop("preference"), n_objectives)
+            sampler = FixedSampler(tuple(w.tolist()), **options)
+        else:
+            raise ValueError(f"its name must be uniform, cone or fixed, not {name!r}")
+    except (TypeError, KeyError, ValueError) as error:
+        raise ValueError(f"preference_sampler={spec!r} is not understood: {error}.") from error
+    return PerStepSampler(sampler) if per_step else sampler
 
 
 def simplex_lattice(n_objectives: int, divisions: int) -> np.ndarray:

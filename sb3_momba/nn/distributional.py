@@ -55,12 +55,13 @@ def cross_entropy(target: th.Tensor, logits: th.Tensor) -> th.Tensor:
     return -(target * th.log_softmax(logits, dim=-1)).sum(dim=-1)
 
 
-def lowest(targets: th.Tensor, values: th.Tensor) -> th.Tensor:
+def lowest(targets: th.Tensor, worth: th.Tensor) -> th.Tensor:
     """Per transition, the target of the critic that expects least (section 3.4.2).
 
     :param targets: (batch, n_critics, n_values, n_atoms)
-    :param values: what each critic's target is worth, scalarised, (batch, n_critics)
+    :param worth: what each critic's target is worth: scalarised, (batch, n_critics, 1), so that all values come from one
+        critic; or value by value, (batch, n_critics, n_values)
     :return: (batch, 1, n_values, n_atoms)
     """
-    rows = th.arange(len(targets), device=targets.device)
-    return targets[rows, values.argmin(dim=1)].unsqueeze(1)
+    index = worth.argmin(dim=1, keepdim=True)[..., None]
+    return targets.gather(1, index.expand(-1, 1, *targets.shape[2:]))

@@ -51,14 +51,19 @@ def dense(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.
     return th.baddbmm(bias.unsqueeze(1), x, weight.mT)
 
 
+def orthogonal_members_(weight: nn.Parameter) -> None:
+    """Fill (out, in), or each member of (n_members, out, in), with an orthogonal matrix."""
+    for matrix in weight.detach().view(-1, *weight.shape[-2:]):
+        nn.init.orthogonal_(matrix)
+
+
 class HyperDense(nn.Module):
     """W x without bias, whose rows `project` puts on the unit hypersphere (weight normalisation, section 3.3)."""
 
     def __init__(self, in_features: int, out_features: int, n_members: int | None = None):
         super().__init__()
         self.weight = nn.Parameter(th.empty(*member_shape(n_members), out_features, in_features))
-        for matrix in self.weight.view(-1, out_features, in_features).unbind():
-            nn.init.orthogonal_(matrix)
+        orthogonal_members_(self.weight)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         return dense(x, self.weight)
@@ -152,6 +157,14 @@ class Linear(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         return dense(x, self.weight, self.bias)
+
+
+def orthogonal_(layer: nn.Module) -> nn.Module:
+    """Start a `Linear` from orthogonal weights and zero biases."""
+    assert isinstance(layer, Linear)
+    orthogonal_members_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 class Film(nn.Module):

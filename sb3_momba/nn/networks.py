@@ -15,12 +15,13 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_momba.nn.layers import Film, HyperEmbedder, HyperHead, HyperLerpBlock, Linear, identity, l2_normalize
+from sb3_momba.nn.layers import Film, HyperEmbedder, HyperHead, HyperLerpBlock, Linear, identity, l2_normalize, orthogonal_
 
 CONDITIONINGS = ("input", "all", "film", "film+all")
 
 SIMBA_LOG_STD_MIN, SIMBA_LOG_STD_MAX = -10.0, 2.0
 SAC_LOG_STD_MIN, SAC_LOG_STD_MAX = -20.0, 2.0
+CAPQL_EPS, CAPQL_LARGEST = 1e-6, 1e3
 LOG_2 = 0.6931471805599453
 HALF_LOG_2PI = 0.9189385332046727
 
@@ -44,6 +45,8 @@ class Trunk(nn.Module):
         super().__init__()
         if conditioning not in CONDITIONINGS:
             raise ValueError(f"conditioning={conditioning!r} is not known: use one of {', '.join(CONDITIONINGS)}.")
+        if preference_dim == 0 and conditioning != "input":
+            raise ValueError(f"conditioning={conditioning!r}: with one objective there is no preference to condition on.")
         self.appended_dim = preference_dim if "all" in conditioning else 0
         self.film_dim = preference_dim if "film" in conditioning else 0
 
@@ -138,14 +141,19 @@ class SimbaArchitecture:
 class MlpArchitecture:
     """SB3 SAC's networks: dense layers with ReLU, linear heads, log std clamped to [-20, 2]."""
 
-    def __init__(self, net_arch: list[int], conditioning: str):
-        self.net_arch, self.conditioning = net_arch, conditioning
+    def __init__(self, net_arch: list[int], conditioning: str, ortho_init: bool):
+        self.net_arch, self.conditioning, self.ortho_init = net_arch, conditioning, ortho_init
 
     def trunk(self, input_dim: int, preference_dim: int, n_members: int | None) -> Trunk:
-        return MlpTrunk(input_dim, preference_dim, self.net_arch, self.conditioning, n_members)
+        trunk = MlpTrunk(input_dim, preference_dim, self.net_arch, self.conditioning, n_members)
+        if self.ortho_init:
+            for layer in trunk.layers:
+                orthogonal_(layer)
+        return trunk
 
     def head(self, features_dim: int, output_dim: int, n_members: int | None) -> nn.Module:
-        return Linear(features_dim, output_dim, n_members)
+        head = Linear(features_dim, output_dim, n_members)
+        return orthogonal_(head) if self.ortho_init else head
 
     def log_std(self, raw: th.Tensor) -> th.Tensor:
         return th.clamp(raw, SAC_LOG_STD_MIN, SAC_LOG_STD_MAX)
@@ -158,9 +166,11 @@ class Actor(nn.Module):
     """
 
     optimizer: th.optim.Optimizer
+    action_scale: th.Tensor | None  # half the width of the action's bounds, where CAPQL's log pi is asked for
 
     def __init__(self, architecture: Architecture, observation_dim: int, preference_dim: int, action_dim: int):
         super().__init__()
+        self.register_buffer("action_scale", None)
         self.observation_dim = observation_dim
         self.trunk = architecture.trunk(observation_dim + preference_dim, preference_dim, None)
         self.mean_head = architecture.head(self.trunk.features_dim, action_dim, None)
@@ -182,10 +192,14 @@ class Actor(nn.Module):
         mean, log_std = self.distribution(observations)
         noise = th.randn_like(mean)
         gaussian = mean + log_std.exp() * noise
+        actions = th.tanh(gaussian)
+        log_prob = -0.5 * noise.square() - log_std - HALF_LOG_2PI
+        if self.action_scale is not None:
+            log_jacobian = th.log(self.action_scale * (1 - actions.square()) + CAPQL_EPS)
+            return actions, (log_prob - log_jacobian).sum(dim=-1).clamp(-CAPQL_LARGEST, CAPQL_LARGEST)
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2x)), which stays finite where tanh saturates.
         log_jacobian = 2 * (LOG_2 - gaussian - F.softplus(-2 * gaussian))
-        log_prob = -0.5 * noise.square() - log_std - HALF_LOG_2PI - log_jacobian
-        return th.tanh(gaussian), log_prob.sum(dim=-1)
+        return actions, (log_prob - log_jacobian).sum(dim=-1)
 
 
 class Critic(nn.Module):

@@ -1,0 +1,1 @@
+"""Hyperparameters in rl_zoo3's yaml format."""

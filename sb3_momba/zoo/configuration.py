@@ -1,0 +1,99 @@
+"""Reading hyperparameters from yaml in rl_zoo3's format. Values are literals: nothing is evaluated."""
+
+import inspect
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_momba.momba import MOMBA
+from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+
+SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
+RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize")
+POLICIES = {"SimbaPolicy": SimbaPolicy, "MlpPolicy": MlpPolicy}
+NOT_FOR_CONFIGURATIONS = {"self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model"}
+INJECTED = set(inspect.signature(MOMBA.__init__).parameters) | {"n_objectives"}
+NOT_FOR_POLICY_KWARGS = {
+    *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
+    *INJECTED,
+}
+
+
+@dataclass
+class Configuration:
+    """One entry of a yaml file."""
+
+    policy: str
+    hyperparameters: dict[str, Any]
+    n_timesteps: int | None = None
+    n_envs: int = 1
+
+
+def shipped_configurations() -> list[str]:
+    """Names of the files that come with the package."""
+    return sorted(file.name.removesuffix(".yml") for file in SHIPPED.iterdir() if file.name.endswith(".yml"))
+
+
+def read_configuration(name: str, env_id: str) -> Configuration:
+    """The entry of an environment in a yaml file, or the file's `default`.
+
+    :param name: path of a yaml file, or name of a shipped one, such as "capql"
+    :raises ValueError: for a missing file or entry, and for unknown keys, with the nearest known name
+    """
+    if name in shipped_configurations():
+        text = (SHIPPED / f"{name}.yml").read_text()
+    elif Path(name).is_file():
+        text = Path(name).read_text()
+    else:
+        raise ValueError(
+            f"{name!r} is neither a yaml file nor a shipped configuration{nearest(name, shipped_configurations())}"
+        )
+    try:
+        entries = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {error}") from error
+    entry = entries.get(env_id, entries.get("default")) if isinstance(entries, dict) else None
+    if not isinstance(entry, dict):
+        raise ValueError(f"{name} has no entry {env_id!r} and no 'default'.")
+    entry = dict(entry)
+    if entry.pop("normalize", False):
+        raise ValueError(f"{name}: normalize must be false: the policy normalises observations and rewards itself.")
+    policy = entry.pop("policy", "SimbaPolicy")
+    n_timesteps, n_envs = entry.pop("n_timesteps", None), entry.pop("n_envs", 1)
+    if isinstance(entry.get("train_freq"), list):
+        entry["train_freq"] = tuple(entry["train_freq"])
+    check_hyperparameters(policy, entry)
+    return Configuration(policy, entry, None if n_timesteps is None else int(n_timesteps), n_envs)
+
+
+def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
+    """:raises ValueError: for names that MOMBA or the policy do not take, with the nearest that they do"""
+    if policy not in POLICIES:
+        raise ValueError(f"The policy {policy!r} is not known{nearest(policy, POLICIES)}")
+    known = parameters(MOMBA) - NOT_FOR_CONFIGURATIONS
+    policy_known = (parameters(POLICIES[policy]) | parameters(MombaPolicy)) - NOT_FOR_POLICY_KWARGS
+    if policy == "MlpPolicy":
+        policy_known -= {"normalize_weights"}
+    for name in hyperparameters:
+        if name not in known:
+            raise ValueError(f"MOMBA has no hyperparameter {name!r}{nearest(name, [*known, *RUN_KEYS])}")
+    policy_kwargs = hyperparameters.get("policy_kwargs") or {}
+    if not isinstance(policy_kwargs, dict):
+        raise ValueError(f"policy_kwargs={policy_kwargs!r}: write a mapping; nothing is evaluated.")
+    for name in policy_kwargs:
+        if name not in policy_known:
+            raise ValueError(f"{policy} has no argument {name!r}{nearest(name, policy_known)}")
+
+
+def parameters(cls: type) -> set[str]:
+    return set(inspect.signature(cls.__init__).parameters)  # type: ignore[misc]
+
+
+def nearest(name: str, known: Any) -> str:
+    """ ": did you mean 'x'?", or a full stop."""
+    near = get_close_matches(str(name), list(known), 1, cutoff=0.5)
+    return f": did you mean {near[0]!r}?" if near else "."
