@@ -141,7 +141,7 @@ def test_capql_target_and_critic_loss_are_those_of_morl_baselines(capql_pair) ->
         next_action, log_prob, _ = theirs.policy.sample(s_next, w)
         q = th.stack([network(s_next, next_action, w) for network in theirs.target_q_nets]).amin(dim=0)
         target = r + (1 - done[:, None]) * theirs.gamma * (q - theirs.alpha * log_prob[:, None])
-        loss = sum(F.mse_loss(network(s, a, w), target) for network in theirs.q_nets) / 2
+    loss = sum(F.mse_loss(network(s, a, w), target) for network in theirs.q_nets) / 2
     th.manual_seed(4)
     seen = []
     original = ours.policy.value.loss
