@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -197,7 +198,7 @@ def assign(hyperparameters: dict[str, Any], assignment: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     try:
         result = run(parse(arguments))
-    except ValueError as error:
+    except (ValueError, MemoryError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     print(report(result))
 

@@ -810,13 +810,14 @@ def test_n_step_returns_are_the_slow_loop(
 
 
 def test_n_step_returns_end_where_learn_resets_the_environment() -> None:
-    """A second call of `learn` begins an episode, though nothing has said that the one before is over."""
+    """A second call of `learn` begins an episode. The one before is cut off, which does not make its state terminal."""
     model = make_model(CountingEnv(length=100), n_steps=3)
     model.learn(5)
     model.learn(5)
     batch = model.replay_buffer.sample(200)
     assert set(batch.observations[:, 1].tolist()) == {0, 1}
     assert th.equal(batch.observations[:, 1], batch.next_observations[:, 1])
+    assert (batch.dones == 0).all()
 
 
 # ------------------------------------------------------------------------------------------- hindsight relabelling
@@ -939,11 +940,26 @@ def test_targets_start_as_copies_of_projected_critics() -> None:
     assert_same(snapshot(model.actor), unit_rows(snapshot(model.actor)))
 
 
-def test_the_two_critics_start_apart() -> None:
+@pytest.mark.parametrize("policy", ["SimbaPolicy", "MlpPolicy"])
+def test_the_critics_of_an_ensemble_start_apart(policy: str) -> None:
     """Clipped double Q-learning has nothing to choose between two equal critics."""
-    for policy in ("SimbaPolicy", "MlpPolicy"):
-        first, second = make_model(policy=policy).critic(th.rand(1, 4), th.rand(1, 2))[0]
-        assert not th.allclose(first, second)
+    for name, (first, second) in snapshot(make_model(policy=policy).critic).items():
+        if name.endswith("weight"):
+            assert not th.isclose(first, second).any(), name
+
+
+def test_scalers_start_as_in_simbav2() -> None:
+    """With h = 8 units: sqrt(2 / h) = 1/2 in the embedder, half of it in a block, 1 in the head. A block mixes 1 / (2 + 1) of
+    x_ffn into x by a parameter that starts at 1 / sqrt(h)."""
+    critic = make_model(policy="SimbaPolicy").critic
+    starts = {"trunk.embedder.scaler.scaler": 0.5, "head.scaler.scaler": 1.0, "head.bias": 0.0}
+    for block in (0, 1):
+        starts |= {f"trunk.blocks.{block}.scaler.scaler": 0.25, f"trunk.blocks.{block}.lerp.scaler": 8**-0.5}
+    parameters = snapshot(critic)
+    assert starts.keys() == {name for name in parameters if not name.endswith("weight")}
+    for name, start in starts.items():
+        th.testing.assert_close(parameters[name], th.full_like(parameters[name], start))
+    assert critic.trunk.blocks[0].lerp(th.ones(1, 8)).flatten().tolist() == pytest.approx([1 / 3] * 16)
 
 
 def test_the_actor_step_follows_the_actor_loss() -> None:
@@ -964,3 +980,22 @@ def test_the_actor_step_follows_the_actor_loss() -> None:
         for parameter, gradient in zip(network.parameters(), gradients, strict=True):
             th.testing.assert_close(parameter.grad, gradient)
     assert all(parameter.grad is None for parameter in model.critic_target.parameters())
+
+
+@pytest.mark.parametrize("nth_loss", [1, 2], ids=["critic loss", "actor loss"])
+def test_an_update_with_a_loss_that_is_not_a_number_changes_nothing(nth_loss: int) -> None:
+    """Neither half an update: critics that have taken their step, but not the projection of their weights."""
+    model = make_model(policy="SimbaPolicy", learning_rate=0.05)
+    model.learn(10)
+    sample, calls = model.actor.action_log_prob, []
+
+    def action_log_prob(observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        calls.append(observations)
+        actions, log_prob = sample(observations)
+        return actions, log_prob * (th.nan if len(calls) == nth_loss else 1)
+
+    model.actor.action_log_prob = action_log_prob
+    before = snapshot(model.policy)
+    model.train(gradient_steps=1, batch_size=16)
+    assert len(calls) == nth_loss
+    assert_same(snapshot(model.policy), before)

@@ -28,11 +28,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_momba import MOMBA, PreferenceWrapper, make_mo_vec_env
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, check_preference
 from sb3_momba.files import FileFormatError, read_tree
+from sb3_momba.momba import NonFiniteLossError
 from tests.stubs import StubEnv, assert_same_tree, observation_of, reward_of, tiny_model
 
 ANY_ACTION = np.zeros(2, dtype=np.float32)
@@ -686,3 +687,77 @@ def test_a_pickled_zip_of_stable_baselines3_loads_with_trust(tmp_path):
     trusted = MOMBA.load(tmp_path / "pickled.zip", trust=True, device="cpu")
     assert_same_tree(trusted.get_parameters(), model.get_parameters())
     assert trusted.n_objectives == 2
+
+
+# ------------------------------------------------------------------------------------------ 22 to 27: settings, divergence
+
+
+def test_row_22_three_environments_and_as_many_updates_as_steps():
+    env = make_mo_vec_env(StubEnv, 3)
+    model = tiny_model(env, learning_starts=6, gradient_steps=-1).learn(30)
+    assert model._n_updates == 24  # 30 steps, of which 6 only fill the buffer
+
+
+def test_row_23_episodes_as_train_freq_need_one_environment():
+    with pytest.raises(ValueError, match=r"train_freq=1 episodes with n_envs=2.*use one environment"):
+        tiny_model(make_mo_vec_env(StubEnv, 2), train_freq=(1, "episode"))
+
+
+def test_row_24_a_buffer_smaller_than_a_batch_and_no_learning_starts():
+    model = tiny_model(StubEnv(), buffer_size=5, batch_size=16, learning_starts=0).learn(20)
+    assert model._n_updates == 20
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+def test_row_25_a_buffer_larger_than_memory_is_an_error_in_gb(monkeypatch):
+    class Memory:
+        available = 1e9
+
+    monkeypatch.setattr("psutil.virtual_memory", lambda: Memory)
+    # 3 + 3 observations, 2 actions, 2 rewards, 2 preferences, 3 flags: 15 numbers of 4 bytes.
+    with pytest.raises(
+        MemoryError, match=r"buffer_size=100,000,000 .*6\.0 GB.*1\.0 GB are free: choose buffer_size=13,333,333"
+    ):
+        tiny_model(StubEnv(), buffer_size=100_000_000)
+
+
+@pytest.mark.parametrize("wrapper", [VecNormalize, lambda venv: VecFrameStack(venv, 2)])
+def test_row_26_wrappers_that_change_observations_or_the_scalar_reward_are_refused(wrapper):
+    with pytest.raises(ValueError, match=r"leave it out|put it inside"):
+        tiny_model(wrapper(make_mo_vec_env(StubEnv, 1)))
+
+
+def test_row_27_a_diverging_loss_is_skipped_and_then_an_error(caplog):
+    model = tiny_model(StubEnv()).learn(30)
+    good = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    original = model._critic_loss
+    model._critic_loss = with_losses(original, [float("nan"), float("inf")])
+    updates = model._n_updates
+    model.train(3, 8)
+    assert model._n_updates == updates + 1
+    assert caplog.text.count("is skipped") == 2
+    model.policy.load_state_dict(good)
+    model._critic_loss = with_losses(original, [float("nan")] * 100)
+    with pytest.raises(NonFiniteLossError, match=r"20 updates in a row.*Lower learning_rate"):
+        model.train(100, 8)
+    assert all(th.equal(good[name], tensor) for name, tensor in model.policy.state_dict().items())
+
+
+def with_losses(original, losses):
+    """A critic loss that is first what it is told to be, then itself."""
+    waiting = list(losses)
+
+    def loss_of(batch, alpha):
+        loss, metrics = original(batch, alpha)
+        return (loss * waiting.pop(0) if waiting else loss), metrics
+
+    return loss_of
+
+
+def test_row_27_an_absurd_learning_rate_ends_in_finite_parameters_or_an_error():
+    model = tiny_model(StubEnv(), policy="MlpPolicy", critic_loss="mse", learning_rate=1e6)
+    try:
+        model.learn(200)
+    except NonFiniteLossError as error:
+        assert "diverges" in str(error)  # noqa: PT017
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())

@@ -121,8 +121,7 @@ class ParetoEvalCallback(EventCallback):
         if front.n_objectives in (2, 3):
             picture = plot_front(front, objectives=self.objectives, title=f"{self.num_timesteps:,} steps")
             self.logger.record("pareto/front", LoggedFigure(picture, close=True), exclude=("stdout", "log", "json", "csv"))
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
+        self.model.dump_logs()
 
     def _write(self, front: ParetoFront) -> None:
         assert self.log_path is not None
