@@ -35,7 +35,16 @@ setup(
     ],
     extras_require={
         "baselines": ["morl-baselines>=1.3"],
-        "test": ["sb3-momba[baselines]", "pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.100", "ruff>=0.15", "mypy>=1.15", "types-PyYAML", "types-psutil"],
+        "test": [
+            "sb3-momba[baselines]",
+            "pytest>=8",
+            "pytest-xdist>=3.6",
+            "hypothesis>=6.100",
+            "ruff>=0.15",
+            "mypy>=1.15",
+            "types-PyYAML",
+            "types-psutil",
+        ],
     },
     classifiers=[
         "Intended Audience :: Science/Research",

@@ -2,29 +2,25 @@
 
 import logging
 import warnings
-from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
+from sb3_momba.acting import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
-from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
-from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.diagnostics import Metrics, TrainingMetrics, weight_norm
+from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
+from sb3_momba.envs.wrappers import make_env, n_objectives_of
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
-from sb3_momba.saving import PickleFreeSaving
 
-BLIND_UPDATES = 1_000
 MAX_SKIPPED_UPDATES = 20
 CHOICES = {
     "critic_loss": ("ce", "mse"),
@@ -32,13 +28,12 @@ CHOICES = {
     "critic_loss_reduction": ("sum", "mean"),
 }
 
-Metrics = dict[str, th.Tensor]
 Self = TypeVar("Self", bound="MOMBA")
 
 logger = logging.getLogger(__name__)
 
 
-class MOMBA(PickleFreeSaving):
+class MOMBA(PreferenceConditionedAlgorithm):
     """Multi-objective RL with expressive function approximators (Algorithm 1 of the thesis).
 
     CAPQL (Lu et al., 2023) with SimbaV2 networks (Lee et al., 2025) and distributional critics: one run learns one policy
@@ -161,8 +156,6 @@ class MOMBA(PickleFreeSaving):
         self.log_ent_coef: th.Tensor | None = None
         self.ent_coef_optimizer: th.optim.Optimizer | None = None
         self.n_objectives = 1 if self.env is None else n_objectives_of(self.env)
-        self._metrics: Metrics = {}
-        self._metrics_count = 0
         if _init_setup_model:
             self._setup_model()
 
@@ -183,8 +176,8 @@ class MOMBA(PickleFreeSaving):
         ).to(self.device)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         self._setup_entropy_coefficient()
-        self._blind_updates = th.zeros((), device=self.device)
-        self._warned_blind = False
+        self._metrics = TrainingMetrics()
+        self._warned_negative = False
         self._skipped_updates = 0
 
     def _check_settings(self) -> None:
@@ -257,99 +250,6 @@ class MOMBA(PickleFreeSaving):
         else:
             self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
 
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Monitor(PreferenceWrapper(env)) in a VecEnv; a VecEnv must have the wrapper already, or be scalar."""
-        if isinstance(env, gym.Env):
-            env = wrap_env(env)
-        venv = PickleFreeSaving._wrap_env(env, verbose, monitor_wrapper)
-        check_vec_env(venv)
-        for wrapper in (VecNormalize, VecFrameStack):
-            if n_objectives_of(venv) > 1 and is_vecenv_wrapped(venv, wrapper):
-                raise ValueError(
-                    f"{wrapper.__name__} changes [observation, preference] or the scalar reward only: leave it out. The policy "
-                    "normalises observations and rewards itself; stack frames inside PreferenceWrapper."
-                )
-        return venv
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        super().set_env(env, force_reset)
-        assert self.env is not None
-        self._prepare_env(self.env)
-
-    def _prepare_env(self, env: VecEnv) -> None:
-        if n_objectives_of(env) != self.n_objectives:
-            raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(env)}.")
-        if self.preference_sampler is not None:
-            env.env_method("set_preference_sampler", make_sampler(self.preference_sampler, self.n_objectives))
-        if self.n_objectives == 1:
-            logger.warning("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
-
-    def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed torch, numpy, the environments, the action space and the replay buffer."""
-        super().set_random_seed(seed)
-        if seed is not None and self.replay_buffer is not None:
-            self.replay_buffer.rng = np.random.default_rng(seed)
-
-    # ---------------------------------------------------------------------------------------------------- acting
-
-    def predict(  # type: ignore[override]
-        self,
-        observation: np.ndarray,
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-        *,
-        preference: Sequence[float] | np.ndarray | None = None,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """The policy's action, within the bounds of the action space.
-
-        :param observation: as the environment gives it, (observation_dim,) or (batch, observation_dim), with `preference`;
-            or [observation, w], as the wrapped environment gives it, without
-        :param preference: (n_objectives,) or (batch, n_objectives)
-        :param deterministic: the mean action instead of a sample
-        :return: (action_dim,) or (batch, action_dim), and `state`
-        :raises ValueError: if one of both is missing, doubled or of the wrong shape
-        """
-        return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
-
-    def _with_preference(self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None) -> np.ndarray:
-        if isinstance(observation, tuple | dict):
-            return observation  # the policy's own error
-        observation = np.asarray(observation)
-        if not np.isfinite(observation).all():
-            raise ValueError(f"The observation {observation} has a number that is not finite: no action answers it.")
-        raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
-        width = observation.shape[-1] if observation.ndim > 0 else 0
-        if preference is None:
-            if width == raw != wrapped:
-                raise ValueError(
-                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights."
-                )
-            return observation
-        w = check_preference(preference, self.n_objectives)
-        if wrapped == raw:
-            return observation
-        if width != raw:
-            raise ValueError(
-                f"With preference=, the observation must be the environment's own, {raw} wide, not {width}"
-                + (", which carries a preference already." if width == wrapped else ".")
-            )
-        if observation.ndim < w.ndim or (w.ndim == 2 and len(w) != len(observation)):
-            raise ValueError(f"Observations of shape {observation.shape} and preferences of shape {w.shape} do not match.")
-        w = np.broadcast_to(w, (*observation.shape[:-1], self.n_objectives))
-        return np.concatenate([observation, w], axis=-1, dtype=np.float32)
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's is asked for."""
-        if not self.deterministic_exploration or self.num_timesteps < learning_starts:
-            return super()._sample_action(learning_starts, action_noise, n_envs)
-        assert isinstance(self._last_obs, np.ndarray)
-        action, _ = self.predict(self._last_obs, deterministic=True)
-        return action, self.policy.scale_action(action)
-
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -364,21 +264,14 @@ class MOMBA(PickleFreeSaving):
         observations = self._last_obs[:, : self.policy.observation_dim]
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
-        self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        """SB3's; where it resets the environments, the episodes that were going on end here."""
-        if reset_num_timesteps or self._last_obs is None:
-            self.policy.return_scale.end_episodes()
-            self.replay_buffer.end_episodes()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        finished = self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
+        if self.preference_alignment and not self._warned_negative and (finished < 0).any():
+            self._warned_negative = True
+            warnings.warn(
+                "preference_alignment assumes returns that are not negative (section 3.5.2): the cosine of eq. (3.21) steers "
+                f"the wrong way where they are. An episode has just returned {finished.min(axis=0).tolist()}, discounted.",
+                stacklevel=2,
+            )
 
     # -------------------------------------------------------------------------------------------------- learning
 
@@ -402,22 +295,24 @@ class MOMBA(PickleFreeSaving):
         alpha = self.alpha
         critic_loss, critic_metrics = self._critic_loss(batch, alpha)
         descend(self.critic.optimizer, critic_loss)
-        actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
-        descend(self.actor.optimizer, actor_loss)
-        if self.ent_coef_optimizer is not None:
-            descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
-        self.policy.project_weights()
-        move_towards(self.critic_target, self.critic, self.tau)
+        try:
+            actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
+            descend(self.actor.optimizer, actor_loss)
+            if self.ent_coef_optimizer is not None:
+                descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
+        finally:  # The critics have taken their step, even where the actor's is skipped.
+            self.policy.project_weights()
+            move_towards(self.critic_target, self.critic, self.tau)
         self._n_updates += 1
-        self._note({**critic_metrics, **actor_metrics, "ent_coef": alpha})
+        self._metrics.add({**critic_metrics, **actor_metrics, "ent_coef": alpha})
 
     def _skip_update(self, error: "NonFiniteLossError") -> None:
-        """Go on after one bad loss; give up, with the parameters of the last good one, after many in a row."""
+        """Go on after a bad loss; give up after many in a row, each network as its last good step left it."""
         self._skipped_updates += 1
         if self._skipped_updates >= MAX_SKIPPED_UPDATES:
             raise NonFiniteLossError(
-                f"{self._skipped_updates} updates in a row had a loss that is not finite: the training diverges. Parameters "
-                f"are those before the first of them. Lower learning_rate={self.learning_rate}, or check the rewards."
+                f"{self._skipped_updates} updates in a row had a loss that is not finite: the training diverges. Each network "
+                f"is as its last good step left it. Lower learning_rate={self.learning_rate}, or check the rewards."
             ) from error
         logger.warning("Update %d is skipped: %s", self._n_updates + 1, error)
 
@@ -485,42 +380,15 @@ class MOMBA(PickleFreeSaving):
         """w.Q of eqs. (3.12) and (3.16): (batch, n_critics, n_values) -> (batch, n_critics)."""
         return scalarise(values, preferences[:, None]) if self.vector_values else values.squeeze(-1)
 
-    # --------------------------------------------------------------------------------------------------- logging
-
-    def _note(self, metrics: Metrics) -> None:
-        """Add up metrics as tensors; `dump_logs` turns their means into numbers."""
-        for name, value in metrics.items():
-            self._metrics[name] = self._metrics[name] + value if name in self._metrics else value
-        self._metrics_count += 1
-        blind = metrics["target_end_mass"] > 0.5
-        self._blind_updates = (self._blind_updates + 1) * blind
-        if not self._warned_blind and self._n_updates % BLIND_UPDATES == 0 and self._blind_updates >= BLIND_UPDATES:
-            self._warned_blind = True
-            warnings.warn(
-                f"For {BLIND_UPDATES} updates more than half of the critics' target mass has been on an end of their support: "
-                "they cannot tell good from better. At the start this comes from a large entropy coefficient: try "
-                'ent_coef="auto_0.01", a wider support, or a smaller best_return_scale.',
-                stacklevel=2,
-            )
-
     def dump_logs(self) -> None:
         """Write the log, with the means of the training metrics since the last time."""
-        self._record_metrics()
+        if self._metrics.count > 0:
+            self._metrics.record(self.logger)
+            self.logger.record("train/return_scale", self.policy.return_scale.factor)
+            self.logger.record("train/actor_weight_norm", weight_norm(self.actor))
+            self.logger.record("train/critic_weight_norm", weight_norm(self.critic))
+            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         super().dump_logs()
-
-    def _record_metrics(self) -> None:
-        if self._metrics_count == 0:
-            return
-        for name, total in self._metrics.items():
-            mean = np.atleast_1d((total / self._metrics_count).cpu().numpy())
-            for i, number in enumerate(mean):
-                self.logger.record(f"train/{name}" + (f"_{i}" if len(mean) > 1 else ""), float(number))
-        self.logger.record("train/return_scale", self.policy.return_scale.factor)
-        for name, network in (("actor", self.actor), ("critic", self.critic)):
-            norms = th.stack([p.detach().square().sum() for p in network.parameters()])
-            self.logger.record(f"train/{name}_weight_norm", float(norms.sum().sqrt()))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._metrics, self._metrics_count = {}, 0
 
     def learn(
         self: Self,
@@ -537,7 +405,7 @@ class MOMBA(PickleFreeSaving):
     # ---------------------------------------------------------------------------------------------------- saving
 
     def _excluded_save_params(self) -> list[str]:
-        derived = ["actor", "critic", "critic_target", "lr_schedule", "_metrics", "_metrics_count", "_blind_updates"]
+        derived = ["actor", "critic", "critic_target", "lr_schedule", "_metrics"]
         return [*super()._excluded_save_params(), *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -558,13 +426,13 @@ def move_towards(target: th.nn.Module, network: th.nn.Module, tau: float) -> Non
 
 
 class NonFiniteLossError(ArithmeticError):
-    """A loss is NaN or infinite; nothing was changed by it."""
+    """A loss is NaN or infinite; it changed nothing of its network."""
 
 
 def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
     """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
     if not th.isfinite(loss):
-        raise NonFiniteLossError(f"its loss is {float(loss)}.")
+        raise NonFiniteLossError(f"its loss is {loss.item()}.")
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     optimizer.zero_grad(set_to_none=True)
     loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]

@@ -983,8 +983,8 @@ def test_the_actor_step_follows_the_actor_loss() -> None:
 
 
 @pytest.mark.parametrize("nth_loss", [1, 2], ids=["critic loss", "actor loss"])
-def test_an_update_with_a_loss_that_is_not_a_number_changes_nothing(nth_loss: int) -> None:
-    """Neither half an update: critics that have taken their step, but not the projection of their weights."""
+def test_a_loss_that_is_not_a_number_changes_nothing_of_its_network(nth_loss: int) -> None:
+    """Nor is there half an update: critics that have taken their step are projected, and their targets follow."""
     model = make_model(policy="SimbaPolicy", learning_rate=0.05)
     model.learn(10)
     sample, calls = model.actor.action_log_prob, []
@@ -995,7 +995,16 @@ def test_an_update_with_a_loss_that_is_not_a_number_changes_nothing(nth_loss: in
         return actions, log_prob * (th.nan if len(calls) == nth_loss else 1)
 
     model.actor.action_log_prob = action_log_prob
-    before = snapshot(model.policy)
+    before, old_target, beta = snapshot(model.policy), snapshot(model.critic_target), model.log_ent_coef.item()
     model.train(gradient_steps=1, batch_size=16)
     assert len(calls) == nth_loss
-    assert_same(snapshot(model.policy), before)
+    assert model.log_ent_coef.item() == beta
+    assert_same(snapshot(model.actor), {name[6:]: p for name, p in before.items() if name.startswith("actor.")})
+    if nth_loss == 1:
+        assert_same(snapshot(model.policy), before)
+        return
+    for name, parameter in model.critic.named_parameters():
+        target = dict(model.critic_target.named_parameters())[name]
+        th.testing.assert_close(target, old_target[name] + model.tau * (parameter - old_target[name]))
+        if "dense" in name:
+            th.testing.assert_close(parameter.norm(dim=-1), th.ones(parameter.shape[:-1]))

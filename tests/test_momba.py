@@ -17,7 +17,6 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-import sb3_momba.momba
 from sb3_momba import MOMBA, MlpPolicy, PreferenceWrapper, SimbaPolicy, make_mo_vec_env
 from sb3_momba.envs.preferences import FixedSampler
 from tests.stubs import StubEnv, assert_same_tree, reward_of, tiny_model
@@ -411,7 +410,7 @@ def blind_model(**kwargs: Any) -> MOMBA:
 
 
 def test_a_blind_critic_is_said_once_and_with_the_cure(monkeypatch, recwarn):
-    monkeypatch.setattr(sb3_momba.momba, "BLIND_UPDATES", 10)
+    monkeypatch.setattr("sb3_momba.diagnostics.BLIND_UPDATES", 10)
     blind_model(ent_coef=50.0).learn(60)
     said = [str(warning.message) for warning in recwarn if "target mass" in str(warning.message)]
     assert len(said) == 1
@@ -421,13 +420,13 @@ def test_a_blind_critic_is_said_once_and_with_the_cure(monkeypatch, recwarn):
 
 @pytest.mark.parametrize("kwargs", [{"ent_coef": 0.0}, {"ent_coef": 50.0, "critic_loss": "mse"}], ids=["alpha 0", "mse"])
 def test_a_critic_that_sees_is_not_called_blind(kwargs, monkeypatch, recwarn):
-    monkeypatch.setattr(sb3_momba.momba, "BLIND_UPDATES", 10)
+    monkeypatch.setattr("sb3_momba.diagnostics.BLIND_UPDATES", 10)
     blind_model(**kwargs).learn(60)
     assert [warning for warning in recwarn if "target mass" in str(warning.message)] == []
 
 
 def test_blindness_must_last_without_a_break(monkeypatch, recwarn):
-    monkeypatch.setattr(sb3_momba.momba, "BLIND_UPDATES", 10)
+    monkeypatch.setattr("sb3_momba.diagnostics.BLIND_UPDATES", 10)
     model = blind_model(ent_coef=50.0)
     model.learn(6 + 8)
     model.ent_coef_tensor.fill_(0.0)

@@ -382,3 +382,11 @@ def test_a_run_does_not_overwrite_another(tmp_path) -> None:
     (tmp_path / "something").touch()
     with pytest.raises(SystemExit, match="not an empty folder: choose another"):
         main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path)])
+
+
+@pytest.mark.parametrize(("sign", "warns"), [(1, False), (-1, True)])
+def test_preference_alignment_warns_once_of_negative_returns(sign: int, warns: bool, recwarn) -> None:
+    rewards = {t: np.array([1.0, sign * 2.0]) for t in range(1, 31)}
+    kwargs = {"buffer_size": 50, "learning_starts": 50, "policy_kwargs": TINY_SIMBA}
+    MOMBA("SimbaPolicy", StubEnv(rewards=rewards), vector_values=True, preference_alignment=True, **kwargs).learn(30)
+    assert sum("not negative" in str(warning.message) for warning in recwarn) == int(warns)

@@ -37,7 +37,8 @@ def project(probabilities: th.Tensor, atoms: th.Tensor, support: th.Tensor) -> t
     position = position.clamp(0, last).expand_as(probabilities)
     lower = position.floor().clamp(max=last - 1)
     share_of_upper = position - lower
-    index = lower.long()
+    # What is not a number must stay one, instead of an index out of bounds.
+    index = lower.nan_to_num().long()
     to_upper = probabilities * share_of_upper
     projected = th.zeros_like(probabilities)
     projected.scatter_add_(-1, index, probabilities - to_upper)

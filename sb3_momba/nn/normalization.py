@@ -65,16 +65,20 @@ class ReturnScale(nn.Module):
         self.register_buffer("max_return", th.zeros((), dtype=th.float64))
         self.running_returns: np.ndarray | None = None
 
-    def update(self, rewards: np.ndarray, dones: np.ndarray) -> None:
+    def update(self, rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
         """
         :param rewards: (n_envs, n_objectives)
         :param dones: where an episode has just ended, (n_envs,)
+        :return: G of those episodes, (n_ended, n_objectives)
         """
         if self.running_returns is None or self.running_returns.shape != rewards.shape:
             self.running_returns = np.zeros(rewards.shape, dtype=np.float64)
         self.running_returns = self.gamma * self.running_returns + rewards
         self.max_return.fill_(max(float(self.max_return), float(np.abs(self.running_returns).max())))
-        self.running_returns[dones.astype(bool)] = 0.0
+        ended = dones.astype(bool)
+        finished = self.running_returns[ended]
+        self.running_returns[ended] = 0.0
+        return finished
 
     def end_episodes(self) -> None:
         """The next rewards begin new returns, in any number of environments."""

@@ -1,0 +1,133 @@
+"""What makes an off-policy algorithm act on preferences: environments, prediction, exploration, episodes."""
+
+import logging
+from collections.abc import Sequence
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
+
+from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
+from sb3_momba.envs.wrappers import check_vec_env, n_objectives_of, wrap_env
+from sb3_momba.policies import MombaPolicy
+from sb3_momba.saving import PickleFreeSaving
+
+logger = logging.getLogger(__name__)
+
+
+class PreferenceConditionedAlgorithm(PickleFreeSaving):
+    """An off-policy algorithm whose policy reads [observation, preference]."""
+
+    policy: MombaPolicy
+    preference_sampler: PreferenceSampler | SamplerSpec | None
+    deterministic_exploration: bool
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """Monitor(PreferenceWrapper(env)) in a VecEnv; a VecEnv must have the wrapper already, or be scalar."""
+        if isinstance(env, gym.Env):
+            env = wrap_env(env)
+        venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        check_vec_env(venv)
+        for wrapper in (VecNormalize, VecFrameStack):
+            if n_objectives_of(venv) > 1 and is_vecenv_wrapped(venv, wrapper):
+                raise ValueError(
+                    f"{wrapper.__name__} changes [observation, preference] or the scalar reward only: leave it out. The policy "
+                    "normalises observations and rewards itself; stack frames inside PreferenceWrapper."
+                )
+        return venv
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """SB3's; an environment with another number of objectives is refused before anything changes."""
+        venv = self._wrap_env(env, self.verbose)
+        self._prepare_env(venv)
+        super().set_env(venv, force_reset)
+
+    def _prepare_env(self, env: VecEnv) -> None:
+        if n_objectives_of(env) != self.n_objectives:
+            raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(env)}.")
+        if self.preference_sampler is not None:
+            env.env_method("set_preference_sampler", make_sampler(self.preference_sampler, self.n_objectives))
+        if self.n_objectives == 1:
+            logger.warning("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed torch, numpy, the environments, the action space and the replay buffer."""
+        super().set_random_seed(seed)
+        if seed is not None and self.replay_buffer is not None:
+            self.replay_buffer.rng = np.random.default_rng(seed)
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        *,
+        preference: Sequence[float] | np.ndarray | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """The policy's action, within the bounds of the action space.
+
+        :param observation: as the environment gives it, (observation_dim,) or (batch, observation_dim), with `preference`;
+            or [observation, w], as the wrapped environment gives it, without
+        :param preference: (n_objectives,) or (batch, n_objectives)
+        :param deterministic: the mean action instead of a sample
+        :return: (action_dim,) or (batch, action_dim), and `state`
+        :raises ValueError: if one of both is missing, doubled or of the wrong shape
+        """
+        return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
+
+    def _with_preference(self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None) -> np.ndarray:
+        if isinstance(observation, tuple | dict):
+            return observation  # the policy's own error
+        observation = np.asarray(observation)
+        if not np.isfinite(observation).all():
+            raise ValueError(f"The observation {observation} has a number that is not finite: no action answers it.")
+        raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
+        width = observation.shape[-1] if observation.ndim > 0 else 0
+        if preference is None:
+            if width == raw != wrapped:
+                raise ValueError(
+                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights."
+                )
+            return observation
+        w = check_preference(preference, self.n_objectives)
+        if wrapped == raw:
+            return observation
+        if width != raw:
+            raise ValueError(
+                f"With preference=, the observation must be the environment's own, {raw} wide, not {width}"
+                + (", which carries a preference already." if width == wrapped else ".")
+            )
+        if observation.ndim < w.ndim or (w.ndim == 2 and len(w) != len(observation)):
+            raise ValueError(f"Observations of shape {observation.shape} and preferences of shape {w.shape} do not match.")
+        w = np.broadcast_to(w, (*observation.shape[:-1], self.n_objectives))
+        return np.concatenate([observation, w], axis=-1, dtype=np.float32)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's is asked for."""
+        if not self.deterministic_exploration or self.num_timesteps < learning_starts:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        assert isinstance(self._last_obs, np.ndarray)
+        action, _ = self.predict(self._last_obs, deterministic=True)
+        return action, self.policy.scale_action(action)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """SB3's; where it resets the environments, the episodes that were going on end here."""
+        if reset_num_timesteps or self._last_obs is None:
+            self.policy.return_scale.end_episodes()
+            self.replay_buffer.end_episodes()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
