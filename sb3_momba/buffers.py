@@ -106,12 +106,20 @@ class PreferenceReplayBuffer(ReplayBuffer):
         :param infos: with `vector_reward` from PreferenceWrapper
         """
         vector_rewards = self._vector_rewards(reward, infos)
-        if not np.isfinite(next_obs).all():
-            index = int((~np.isfinite(next_obs)).any(axis=1).argmax())
-            raise ValueError(f"Environment {index}: the observation {next_obs[index]} has a number that is not finite.")
+        for observations in (obs, next_obs):
+            if not np.isfinite(observations).all():
+                index = int((~np.isfinite(observations)).any(axis=1).argmax())
+                raise ValueError(f"Environment {index}: the observation {observations[index]} has a number that is not finite.")
         raw = self.observation_dim
         if self.preference_dim > 0:
-            self.preferences[self.pos] = obs[:, raw:]
+            preferences = obs[:, raw:]
+            reported = [info["preference"] for info in infos if "preference" in info]
+            if reported and not np.array_equal(preferences, reported):
+                raise ValueError(
+                    f"The observations end in {preferences.tolist()}, not in the environments' preferences: a wrapper outside "
+                    "PreferenceWrapper changes them. Put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
+                )
+            self.preferences[self.pos] = preferences
         super().add(obs[:, :raw], next_obs[:, :raw], action, vector_rewards, done, infos)
 
     @property

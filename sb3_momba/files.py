@@ -10,12 +10,13 @@ import io
 import json
 import math
 import os
+import re
 import sys
 import warnings
 import zipfile
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +28,7 @@ from torch import nn
 TRUSTED_ROOTS = ("torch", "stable_baselines3", "sb3_momba")
 NAMEABLE_BASES = (nn.Module, th.optim.Optimizer, BaseBuffer)
 ARRAY_KINDS = "biuf"
+LONGEST_NAME = 120
 
 FilePath = str | os.PathLike[str] | io.BufferedIOBase
 
@@ -122,22 +124,7 @@ def read_tree(path: FilePath) -> tuple[Any, list[str]]:
         raise
     except FileFormatError as error:
         raise FileFormatError(f"{name}: {error}") from error
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        OSError,
-        EOFError,
-        KeyError,
-        IndexError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        NotImplementedError,
-        RuntimeError,
-        MemoryError,
-        RecursionError,
-        OverflowError,
-    ) as error:
+    except Exception as error:
         raise FileFormatError(f"{name} is damaged, or not a file of sb3_momba: {type(error).__name__}: {error}") from error
 
 
@@ -145,6 +132,7 @@ class _Encoder:
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}
         self.left_out: list[str] = []
+        self.inside_object = False
 
     def encode(self, x: Any, place: str) -> Any:
         if x is None or isinstance(x, bool | str):
@@ -154,12 +142,14 @@ class _Encoder:
         if isinstance(x, float | np.floating):
             return float(x) if math.isfinite(x) else {"~": "float", "value": repr(float(x))}
         if isinstance(x, th.Tensor):
+            if x.dtype == th.bfloat16:
+                raise TypeError(f"{place} is a bfloat16 tensor, which NumPy's files do not have: store x.float().")
             return {"~": "tensor", "file": self._store(x.detach().cpu().numpy(), place)}
         if isinstance(x, np.ndarray):
             return {"~": "array", "file": self._store(x, place)}
         name = qualified_name(type(x))
         if name in _codecs and _codecs[name][0] is type(x):
-            return {"~": "object", "class": name, "state": self.encode(_codecs[name][1](x), place)}
+            return {"~": "object", "class": name, "state": self._encode_whole(_codecs[name][1](x), place)}
         if isinstance(x, dict):
             return self._encode_dict(x, place)
         if type(x) in (list, tuple, deque):
@@ -174,6 +164,14 @@ class _Encoder:
             "with exclude=[...]."
         )
 
+    def _encode_whole(self, state: Any, place: str) -> Any:
+        """An object's state, of which nothing may be left out: it could not be made again."""
+        outer, self.inside_object = self.inside_object, True
+        try:
+            return self.encode(state, place)
+        finally:
+            self.inside_object = outer
+
     def _encode_dict(self, x: dict[Any, Any], place: str) -> Any:
         pairs = []
         for key, value in x.items():
@@ -181,7 +179,7 @@ class _Encoder:
             try:
                 pairs.append((key, self.encode(value, where)))
             except TypeError:
-                if not callable(value):
+                if self.inside_object or not callable(value):
                     raise
                 self.left_out.append(where)
         if all(isinstance(key, str) for key in x) and "~" not in x:
@@ -191,9 +189,11 @@ class _Encoder:
     def _store(self, array: np.ndarray, place: str) -> str:
         if array.dtype.kind not in ARRAY_KINDS:
             raise TypeError(f"{place} is an array of dtype {array.dtype}: only numbers can be stored.")
-        name = place.replace("/", "_")
-        while name in self.arrays:
-            name += "_"
+        plain = name = re.sub(r"[^A-Za-z0-9._-]", "_", place)[:LONGEST_NAME]
+        for number in count(2):
+            if name not in self.arrays:
+                break
+            name = f"{plain}_{number}"
         self.arrays[name] = array
         return name
 
@@ -231,8 +231,12 @@ class _Decoder:
         raise FileFormatError(f"it holds a value of unknown kind {kind!r}: it may be of a newer version.")
 
     def _load(self, name: str) -> np.ndarray:
-        with self.archive.open(f"{name}.npy") as file:
-            return np.lib.format.read_array(file, allow_pickle=False)
+        # Read as a whole, so that its checksum is compared before it is understood.
+        content = io.BytesIO(self.archive.read(f"{name}.npy"))
+        array = np.lib.format.read_array(content, allow_pickle=False)
+        if content.read(1):
+            raise FileFormatError(f"its array {name!r} has more bytes than numbers.")
+        return array
 
 
 def _find_class(name: str) -> type:

@@ -1,5 +1,6 @@
 """Saving and loading of models and replay buffers in sb3_momba's own files: no pickle, written aside and renamed."""
 
+import inspect
 import io
 import os
 import platform
@@ -93,9 +94,9 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         if print_system_info:
             print(tree["versions"])
         data = {**tree["data"], **(custom_objects or {})}
-        if "policy_kwargs" in kwargs and kwargs["policy_kwargs"] != data["policy_kwargs"]:
+        if "policy_kwargs" in kwargs and kwargs["policy_kwargs"] != data.get("policy_kwargs"):
             raise ValueError(
-                f"The file's policy_kwargs are {data['policy_kwargs']}, not {kwargs['policy_kwargs']}: they cannot be "
+                f"The file's policy_kwargs are {data.get('policy_kwargs')}, not {kwargs['policy_kwargs']}: they cannot be "
                 "changed at load."
             )
         for place in tree["left_out"]:
@@ -106,13 +107,15 @@ class PickleFreeSaving(OffPolicyAlgorithm):
                     "default stands in its place.",
                     stacklevel=2,
                 )
-        if "policy_class" not in data:
-            raise ValueError("The policy class was not stored: pass custom_objects={'policy_class': YourPolicy}.")
-        for name, value in data.items():
+        for name in ("policy_class", "observation_space", "action_space", "n_objectives", "policy_kwargs"):
+            if name not in data:
+                raise ValueError(f"{name} was not stored: pass custom_objects={{{name!r}: ...}}.")
+        for name in ("policy_class", *inspect.signature(cls.__init__).parameters):
+            value = data.get(name)
             if isinstance(value, type) and not issubclass(value, CLASSES_AT.get(name, ())):
                 raise FileFormatError(f"{path}: {name} is the class {value.__name__}, which does not belong there.")
         if env is not None:
-            env = cls._wrap_env(env, data["verbose"])
+            env = cls._wrap_env(env, data.get("verbose", 0))
             _check_env_fits(env, data)
             data["n_envs"] = env.num_envs
             if force_reset:
@@ -126,7 +129,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             for name, tensor in tree["tensors"].items():
                 recursive_getattr(model, name).data.copy_(tensor)
         except (RuntimeError, KeyError, AttributeError, ValueError) as error:
-            raise FileFormatError(f"{path} holds parameters that do not fit its own settings: {error}") from error
+            changed = f" as changed by {kwargs}" if kwargs else ""
+            raise FileFormatError(f"{path} holds parameters that do not fit its own settings{changed}: {error}") from error
         return model
 
     def set_parameters(
@@ -189,7 +193,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             raise FileFormatError("The file's arrays do not have the length that it states.")
 
 
-# What an attribute of a model that is a class may be.
+# What an argument of a model that is a class may be.
 CLASSES_AT = {"policy_class": MombaPolicy, "replay_buffer_class": PreferenceReplayBuffer}
 BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
 
@@ -247,9 +251,10 @@ def with_suffix(path: FilePath, suffix: str) -> FilePath:
 
 def with_existing_suffix(path: FilePath, suffix: str) -> FilePath:
     """The path itself if there is such a file, else with the suffix appended."""
-    if isinstance(path, io.IOBase) or Path(path).exists():  # type: ignore[arg-type]
+    if isinstance(path, io.IOBase) or Path(path).is_file():  # type: ignore[arg-type]
         return path
-    return Path(f"{os.fspath(path)}{suffix}")  # type: ignore[arg-type]
+    suffixed = Path(f"{os.fspath(path)}{suffix}")  # type: ignore[arg-type]
+    return suffixed if suffixed.is_file() else path
 
 
 def _check_env_fits(env: Any, data: dict[str, Any]) -> None:

@@ -138,9 +138,9 @@ def assert_same_tree(ours: Any, theirs: Any, place: str = "tree") -> None:
     """Two nests of dictionaries, lists, tuples, deques, arrays and tensors hold the same types and bit-equal numbers."""
     if isinstance(ours, dict):
         assert isinstance(theirs, dict), place
-        assert list(ours) == list(theirs), place
-        for key in ours:
-            assert_same_tree(ours[key], theirs[key], f"{place}[{key!r}]")
+        assert_same_tree(list(ours), list(theirs), f"the keys of {place}")
+        for (key, our), their in zip(ours.items(), theirs.values(), strict=True):
+            assert_same_tree(our, their, f"{place}[{key!r}]")
         return
     assert type(ours) is type(theirs), f"{place}: {type(ours)} and {type(theirs)}"
     if isinstance(ours, list | tuple | deque):
@@ -150,6 +150,8 @@ def assert_same_tree(ours: Any, theirs: Any, place: str = "tree") -> None:
             assert_same_tree(our, their, f"{place}[{i}]")
     elif isinstance(ours, np.ndarray | th.Tensor):
         assert ours.dtype == theirs.dtype, place
-        np.testing.assert_array_equal(ours, theirs, err_msg=place, strict=isinstance(ours, np.ndarray))
+        our, their = np.asarray(ours), np.asarray(theirs)
+        np.testing.assert_array_equal(our, their, err_msg=place, strict=True)
+        assert our.tobytes() == their.tobytes(), place
     else:
         assert ours == theirs or (ours != ours and theirs != theirs), f"{place}: {ours!r} and {theirs!r}"

@@ -245,6 +245,19 @@ def test_learn_goes_on_or_starts_over():
     assert model._n_updates == 10 + 10
 
 
+def test_a_new_learn_ends_the_episodes_that_its_reset_cuts_off():
+    model = tiny_model(StubEnv(episode_length=10), learning_starts=100).learn(4)
+    buffer = model.replay_buffer
+    assert not buffer.dones[:4].any()
+    model.learn(3, reset_num_timesteps=False)
+    assert not buffer.dones[:7].any()
+    model.learn(3)
+    np.testing.assert_array_equal(buffer.dones[:10, 0], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(buffer.timeouts[:10, 0], buffer.dones[:10, 0])
+    largest = max(sum(0.99 ** (last - t) * 10 * t for t in range(first, last + 1)) for first, last in ((1, 7), (8, 10)))
+    assert float(model.policy.return_scale.max_return) == pytest.approx(largest)
+
+
 @pytest.mark.parametrize(
     ("n_envs", "train_freq", "gradient_steps", "expected"),
     [
@@ -427,15 +440,17 @@ def test_a_critic_that_sees_is_not_called_blind(kwargs, monkeypatch, recwarn):
 
 def test_blindness_must_last_without_a_break(monkeypatch, recwarn):
     monkeypatch.setattr("sb3_momba.diagnostics.BLIND_UPDATES", 10)
-    model = blind_model(ent_coef=50.0)
-    model.learn(6 + 8)
-    model.ent_coef_tensor.fill_(0.0)
-    model.learn(1, reset_num_timesteps=False)
-    model.ent_coef_tensor.fill_(50.0)
-    model.learn(8, reset_num_timesteps=False)
-    assert [warning for warning in recwarn if "target mass" in str(warning.message)] == []
-    model.learn(20, reset_num_timesteps=False)
-    assert len([warning for warning in recwarn if "target mass" in str(warning.message)]) == 1
+    model = tiny_model(StubEnv(), ent_coef=50.0, learning_starts=50).learn(50)
+
+    def update(n: int, alpha: float) -> int:
+        """The number of warnings so far, after n updates with this entropy coefficient."""
+        model.ent_coef_tensor.fill_(alpha)
+        model.train(gradient_steps=n, batch_size=16)
+        return len([warning for warning in recwarn if "target mass" in str(warning.message)])
+
+    # Blind in 18 of 20 updates, but never in 10 without a break.
+    assert [update(4, 50.0), update(1, 0.0), update(9, 50.0), update(1, 0.0), update(5, 50.0)] == [0] * 5
+    assert update(10, 50.0) == 1
 
 
 # ---------------------------------------------------------------------------------------------------- predicting
