@@ -1,7 +1,7 @@
 """What makes an off-policy algorithm act on preferences: environments, prediction, exploration, episodes."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
-from sb3_momba.envs.wrappers import check_vec_env, n_objectives_of, wrap_env
+from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
 
@@ -27,10 +27,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     deterministic_exploration: bool
 
     @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+    def _wrap_env(env: GymEnv | str | Callable[[], gym.Env], verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         """Monitor(PreferenceWrapper(env)) in a VecEnv; a VecEnv must have the wrapper already, or be scalar."""
-        if isinstance(env, gym.Env):
-            env = wrap_env(env)
+        if not isinstance(env, VecEnv):
+            env = wrap_env(make_env(env, {"render_mode": "rgb_array"} if isinstance(env, str) else None))
         venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_vec_env(venv)
         for wrapper in (VecNormalize, VecFrameStack):
@@ -44,12 +44,12 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """SB3's; an environment with another number of objectives is refused before anything changes."""
         venv = self._wrap_env(env, self.verbose)
-        self._prepare_env(venv)
+        if n_objectives_of(venv) != self.n_objectives:
+            raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(venv)}.")
         super().set_env(venv, force_reset)
+        self._prepare_env(venv)
 
     def _prepare_env(self, env: VecEnv) -> None:
-        if n_objectives_of(env) != self.n_objectives:
-            raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(env)}.")
         if self.preference_sampler is not None:
             env.env_method("set_preference_sampler", make_sampler(self.preference_sampler, self.n_objectives))
         if self.n_objectives == 1:

@@ -13,6 +13,7 @@ from sb3_momba.envs.preferences import preference_dim
 from sb3_momba.envs.wrappers import LARGEST_REWARD
 
 SMALLEST_CONCENTRATION = 1e-3
+SCALARISATION_TOLERANCE = 1e-4
 
 
 class PreferenceReplayBufferSamples(NamedTuple):
@@ -120,7 +121,20 @@ class PreferenceReplayBuffer(ReplayBuffer):
                     "PreferenceWrapper changes them. Put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
                 )
             self.preferences[self.pos] = preferences
+        self._check_scalar_rewards(reward, vector_rewards, infos)
         super().add(obs[:, :raw], next_obs[:, :raw], action, vector_rewards, done, infos)
+
+    def _check_scalar_rewards(self, reward: np.ndarray, vector_rewards: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """The rewards that come through the wrappers must be the w.r that PreferenceWrapper made."""
+        if "preference" not in infos[0]:
+            return
+        products = vector_rewards * [info["preference"] for info in infos]
+        scale = np.abs(products).sum(axis=1)
+        if (np.abs(reward - products.sum(axis=1)) > SCALARISATION_TOLERANCE * (1 + scale)).any():
+            raise ValueError(
+                f"The rewards {np.asarray(reward).tolist()} are not the scalarised {products.sum(axis=1).tolist()}: a wrapper "
+                "outside PreferenceWrapper changes them. Put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
+            )
 
     @property
     def latest_rewards(self) -> np.ndarray:

@@ -64,7 +64,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     :raises OSError: naming `path`, which is left as it was
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory: give the name of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,8 +77,11 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(aside, path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            aside.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename == os.fspath(aside):
+            raise type(error)(error.errno, error.strerror, os.fspath(path)) from error
         raise
 
 
@@ -240,7 +243,8 @@ class _Decoder:
 
 
 def _find_class(name: str) -> type:
-    for i in range(len(name) - 1, 0, -1):
+    trusted = name.split(".")[0] in TRUSTED_ROOTS
+    for i in range(len(name) - 1 if trusted else 0, 0, -1):
         if name[i] == "." and name[:i] in sys.modules:
             cls = getattr(sys.modules[name[:i]], name[i + 1 :], None)
             if isinstance(cls, type) and nameable_class(cls):

@@ -16,7 +16,7 @@ from sb3_momba.acting import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
 from sb3_momba.diagnostics import Metrics, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
-from sb3_momba.envs.wrappers import make_env, n_objectives_of
+from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
@@ -113,11 +113,11 @@ class MOMBA(PreferenceConditionedAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if isinstance(env, str):
-            env = make_env(env, {"render_mode": "rgb_array"})
+        if env is None and _init_setup_model:
+            raise ValueError("env=None: MOMBA needs an environment to train on; MOMBA.load(path) needs none to predict.")
         super().__init__(
             policy,  # type: ignore[arg-type]
-            env,
+            None if env is None else self._wrap_env(env, verbose),
             learning_rate,
             buffer_size,
             learning_starts,
@@ -241,14 +241,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
         if self.target_entropy == "auto":
             self.target_entropy = -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
         self.target_entropy = float(self.target_entropy)
-        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
-            start = float(self.ent_coef.split("_")[1]) if "_" in self.ent_coef else 1.0
-            if start <= 0:
-                raise ValueError(f"ent_coef={self.ent_coef!r}: alpha must start above 0.")
+        learned, start = parse_ent_coef(self.ent_coef)
+        if learned:
             self.log_ent_coef = th.tensor(start, device=self.device).log().requires_grad_(True)
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
         else:
-            self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
+            self.ent_coef_tensor = th.tensor(start, device=self.device)
 
     def _store_transition(
         self,
@@ -412,6 +410,21 @@ class MOMBA(PreferenceConditionedAlgorithm):
         if self.ent_coef_optimizer is None:
             return ["policy", "actor.optimizer", "critic.optimizer"], ["ent_coef_tensor"]
         return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
+
+
+def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
+    """Whether alpha is learned, and where it starts: "auto" (from 1), "auto_0.2" (from 0.2), or a fixed number."""
+    text = str(ent_coef)
+    learned = text == "auto" or text.startswith("auto_")
+    try:
+        start = float(text.removeprefix("auto").removeprefix("_") or 1.0) if learned else float(text)
+        if start < 0 or (learned and start == 0) or not np.isfinite(start):
+            raise ValueError("out of range")
+    except ValueError as error:
+        raise ValueError(
+            f'ent_coef={ent_coef!r}: give "auto", "auto_0.2" (a start above 0), or a number that is not negative.'
+        ) from error
+    return learned, start
 
 
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:

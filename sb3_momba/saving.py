@@ -38,6 +38,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     """`save`, `load` and the replay buffer's two, with SB3's signatures; loading executes nothing."""
 
     n_objectives: int
+    ent_coef: str | float
+    ent_coef_optimizer: th.optim.Optimizer | None
     replay_buffer: PreferenceReplayBuffer  # type: ignore[assignment]
 
     def save(
@@ -88,7 +90,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         :raises FileFormatError: if the file is damaged or no model
         :raises ValueError: if `env` has other objectives, observations or actions than the model
         """
-        if trust:
+        if trust and pickled_by_sb3(with_existing_suffix(path, ".zip")):
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)  # type: ignore[arg-type]
         tree = read_model(path)
         if print_system_info:
@@ -124,6 +126,10 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         model.__dict__.update(data)
         model.__dict__.update(kwargs)
         model._setup_model()
+        if ("ent_coef_optimizer" in tree["params"]) != (model.ent_coef_optimizer is not None):
+            raise ValueError(
+                f"ent_coef={model.ent_coef!r}: a learned entropy coefficient cannot become a fixed one at load, or back."
+            )
         try:
             model.set_parameters(tree["params"], exact_match=True, device=device)
             for name, tensor in tree["tensors"].items():
@@ -227,18 +233,25 @@ def read_format(path: FilePath, expected: str) -> dict[str, Any]:
 def read_model(path: FilePath) -> dict[str, Any]:
     """The tree of a model's file, complete."""
     path = with_existing_suffix(path, ".zip")
-    if zipfile.is_zipfile(path):  # type: ignore[arg-type]
-        with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
-            if "tree.json" not in archive.namelist() and "_stable_baselines3_version" in archive.namelist():
-                raise FileFormatError(
-                    f"{path} was pickled by Stable-Baselines3: loading it can execute anything. If you made it yourself, "
-                    "MOMBA.load(..., trust=True) reads it."
-                )
+    if pickled_by_sb3(path):
+        raise FileFormatError(
+            f"{path} was pickled by Stable-Baselines3: loading it can execute anything. If you made it yourself, "
+            "MOMBA.load(..., trust=True) reads it."
+        )
     tree = read_format(path, MODEL_FORMAT)
     for part in ("data", "params", "tensors"):
         if not isinstance(tree.get(part), dict):
             raise FileFormatError(f"{path} has no {part!r}: it is not a whole model.")
     return tree
+
+
+def pickled_by_sb3(path: FilePath) -> bool:
+    """Whether a file is a zip as Stable-Baselines3 writes it."""
+    if not zipfile.is_zipfile(path):  # type: ignore[arg-type]
+        return False
+    with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
+        names = archive.namelist()
+    return "_stable_baselines3_version" in names and "tree.json" not in names
 
 
 def with_suffix(path: FilePath, suffix: str) -> FilePath:

@@ -4,6 +4,7 @@ Every error must name the culprit, the value and the cure, and come before anyth
 """
 
 import base64
+import errno
 import io
 import json
 import logging
@@ -30,7 +31,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_momba import MOMBA, PreferenceWrapper, make_mo_vec_env
+from sb3_momba import MOMBA, PreferenceWrapper, files, make_mo_vec_env
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, check_preference
 from sb3_momba.files import FileFormatError, read_tree
 from sb3_momba.momba import NonFiniteLossError
@@ -223,6 +224,13 @@ def test_row_11_a_wrapper_that_changes_the_preference_outside_preference_wrapper
     space = spaces.Box(-np.inf, np.inf, change(np.zeros(5)).shape, np.float32)
     with pytest.raises(ValueError, match=r"outside.* PreferenceWrapper|PreferenceWrapper\(YourWrapper\(env\)\)"):
         tiny_model(gym.wrappers.TransformObservation(wrapped, change, space)).learn(5)
+
+
+@pytest.mark.parametrize("n_objectives", [None, 2])
+def test_row_11_a_wrapper_that_changes_the_reward_outside_preference_wrapper_is_an_error(n_objectives):
+    env = gym.wrappers.TransformReward(PreferenceWrapper(StubEnv(n_objectives)), lambda reward: 2 * reward)
+    with pytest.raises(ValueError, match=r"outside.* PreferenceWrapper|PreferenceWrapper\(YourWrapper\(env\)\)"):
+        tiny_model(env).learn(5)
 
 
 def test_row_12_environments_with_different_numbers_of_objectives_are_an_error_at_construction():
@@ -478,6 +486,19 @@ def test_row_31_an_impossible_target_is_an_error_that_names_it_as_the_caller_did
     with pytest.raises(OSError, match="x" * 252) as error:
         model.save(long_name)
     assert ".part" not in str(error.value)
+
+
+def test_row_31_a_read_only_directory_is_an_error_that_names_the_target_as_the_caller_did(saved, monkeypatch):
+    model, path, content = saved
+
+    def refuse(name: os.PathLike[str], mode: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(name))
+
+    monkeypatch.setattr(files, "open", refuse, raising=False)
+    with pytest.raises(PermissionError, match=r"model\.zip") as error:
+        model.save(path)
+    assert ".part" not in str(error.value)
+    assert path.read_bytes() == content
 
 
 class Exploit:

@@ -120,7 +120,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def _next_preference(self) -> np.ndarray:
         if self._fixed_preference is not None:
             return self._fixed_preference.copy()
-        return self._one_preference(self.preference_sampler(self._rng))
+        drawn = self.preference_sampler(self._rng)
+        try:
+            return self._one_preference(drawn)
+        except ValueError as error:
+            raise ValueError(
+                f"The preference sampler {self.preference_sampler!r} drew what is no preference. {error}"
+            ) from error
 
     def _one_preference(self, preference: Sequence[float] | np.ndarray) -> np.ndarray:
         w = check_preference(preference, self.n_objectives)
