@@ -23,6 +23,7 @@ setup(
         "stable-baselines3>=2.9,<3",
         "torch>=2.4",
         "gymnasium[mujoco]>=1.1",
+        "mujoco>=3.2",
         "mo-gymnasium>=1.3",
         "moocore>=0.3",
         "numpy>=1.26",

@@ -1,5 +1,7 @@
 """Train one policy for every trade-off, then choose one."""
 
+import mo_gymnasium
+
 from sb3_momba import MOMBA, evaluate_front, plot_front
 
 model = MOMBA("SimbaPolicy", "mo-hopper-2obj-v5", ent_coef="auto_0.01", seed=0, verbose=1)
@@ -9,7 +11,7 @@ front = evaluate_front(model, "mo-hopper-2obj-v5", n_preferences=20, n_episodes=
 print(f"hypervolume {front.hypervolume():,.0f}, preference regret {front.preference_regret():.1f}")
 plot_front(front, "front.png", objectives=["forward speed", "jumping height"])
 
-env = model.get_env()
-observation = env.envs[0].unwrapped.reset(seed=0)[0]
+env = mo_gymnasium.make("mo-hopper-2obj-v5")
+observation, _ = env.reset(seed=0)
 action, _ = model.predict(observation, preference=[0.3, 0.7], deterministic=True)
 print("action for 30 % speed, 70 % height:", action)

@@ -2,6 +2,7 @@
 
 __version__ = "0.1.0"
 
+import sb3_momba.envs.pgmorl  # noqa: F401  registers the tasks of the thesis
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.envs.wrappers import PreferenceWrapper, make_mo_vec_env
 from sb3_momba.momba import MOMBA

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
@@ -30,15 +30,13 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     def _wrap_env(env: GymEnv | str | Callable[[], gym.Env], verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         """Monitor(PreferenceWrapper(env)) in a VecEnv; a VecEnv must have the wrapper already, or be scalar."""
         if not isinstance(env, VecEnv):
-            env = wrap_env(make_env(env, {"render_mode": "rgb_array"} if isinstance(env, str) else None))
+            env = wrap_env(make_env(env, render_mode="rgb_array"))
         venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_vec_env(venv)
-        for wrapper in (VecNormalize, VecFrameStack):
-            if n_objectives_of(venv) > 1 and is_vecenv_wrapped(venv, wrapper):
-                raise ValueError(
-                    f"{wrapper.__name__} changes [observation, preference] or the scalar reward only: leave it out. The policy "
-                    "normalises observations and rewards itself; stack frames inside PreferenceWrapper."
-                )
+        if is_vecenv_wrapped(venv, VecNormalize):
+            raise ValueError("VecNormalize changes what the replay buffer stores: leave it out. The policy normalises itself.")
+        if n_objectives_of(venv) > 1 and is_vecenv_wrapped(venv, VecFrameStack):
+            raise ValueError("VecFrameStack stacks preferences too: leave it out, and stack frames inside PreferenceWrapper.")
         return venv
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -50,16 +48,17 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         self._prepare_env(venv)
 
     def _prepare_env(self, env: VecEnv) -> None:
-        if self.preference_sampler is not None:
-            env.env_method("set_preference_sampler", make_sampler(self.preference_sampler, self.n_objectives))
+        if self.preference_sampler is not None and self.n_objectives > 1:
+            sampler = make_sampler(self.preference_sampler, self.n_objectives)
+            env.env_method("set_preference_sampler", CloudpickleWrapper(sampler))
         if self.n_objectives == 1:
-            logger.warning("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
+            logger.info("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed torch, numpy, the environments, the action space and the replay buffer."""
         super().set_random_seed(seed)
         if seed is not None and self.replay_buffer is not None:
-            self.replay_buffer.rng = np.random.default_rng(seed)
+            self.replay_buffer.seed(seed)
 
     def predict(  # type: ignore[override]
         self,
@@ -116,7 +115,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, np.ndarray)
         action, _ = self.predict(self._last_obs, deterministic=True)
-        return action, self.policy.scale_action(action)
+        scaled = self.policy.scale_action(action)
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
 
     def _setup_learn(
         self,
@@ -130,4 +132,5 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         if reset_num_timesteps or self._last_obs is None:
             self.policy.return_scale.end_episodes()
             self.replay_buffer.end_episodes()
+        self.replay_buffer.check_memory()
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)

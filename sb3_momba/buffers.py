@@ -14,6 +14,7 @@ from sb3_momba.envs.wrappers import LARGEST_REWARD
 
 SMALLEST_CONCENTRATION = 1e-3
 SCALARISATION_TOLERANCE = 1e-4
+STORED_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
 
 
 class PreferenceReplayBufferSamples(NamedTuple):
@@ -75,7 +76,6 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self.preference_dim = preference_dim(n_objectives)
         raw_dim = observation_space.shape[0] - self.preference_dim
         raw_space = spaces.Box(observation_space.low[:raw_dim], observation_space.high[:raw_dim], dtype=np.float32)
-        _check_memory(buffer_size, numbers=2 * raw_dim + action_space.shape[0] + 2 * n_objectives + 3)
         super().__init__(buffer_size, raw_space, action_space, device, n_envs)
         self.rewards = np.zeros((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.preferences = np.ones((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
@@ -83,7 +83,25 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self.n_steps = n_steps
         self.keep_probability = keep_probability
         self.concentration = concentration
-        self.rng = np.random.default_rng(seed)
+        self.seed(seed)
+
+    def seed(self, seed: int | None) -> None:
+        """Start the buffer's random stream, which is not that of an environment with the same seed."""
+        self.rng = np.random.default_rng(None if seed is None else [seed, 2])
+
+    def check_memory(self) -> None:
+        """
+        :raises MemoryError: if the buffer cannot fit into this machine's memory once it is full
+        """
+        arrays = [getattr(self, name) for name in STORED_ARRAYS]
+        unwritten = 1 - self.size() / self.buffer_size  # memory is taken only when it is written
+        needed, available = unwritten * sum(array.nbytes for array in arrays), psutil.virtual_memory().available
+        if needed > available:
+            n = self.buffer_size * self.n_envs
+            raise MemoryError(
+                f"A replay buffer of buffer_size={n:,} transitions grows by {needed / 1e9:.1f} GB; {available / 1e9:.1f} GB "
+                f"are free: choose buffer_size={int(0.8 * available / needed * n):,} or less."
+            )
 
     @property
     def observation_dim(self) -> int:
@@ -112,29 +130,30 @@ class PreferenceReplayBuffer(ReplayBuffer):
                 index = int((~np.isfinite(observations)).any(axis=1).argmax())
                 raise ValueError(f"Environment {index}: the observation {observations[index]} has a number that is not finite.")
         raw = self.observation_dim
+        if "preference" in infos[0]:
+            self._check_wrapper_order(obs[:, raw:], reward, vector_rewards, infos)
         if self.preference_dim > 0:
-            preferences = obs[:, raw:]
-            reported = [info["preference"] for info in infos if "preference" in info]
-            if reported and not np.array_equal(preferences, reported):
-                raise ValueError(
-                    f"The observations end in {preferences.tolist()}, not in the environments' preferences: a wrapper outside "
-                    "PreferenceWrapper changes them. Put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
-                )
-            self.preferences[self.pos] = preferences
-        self._check_scalar_rewards(reward, vector_rewards, infos)
+            self.preferences[self.pos] = obs[:, raw:]
         super().add(obs[:, :raw], next_obs[:, :raw], action, vector_rewards, done, infos)
 
-    def _check_scalar_rewards(self, reward: np.ndarray, vector_rewards: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        """The rewards that come through the wrappers must be the w.r that PreferenceWrapper made."""
-        if "preference" not in infos[0]:
+    def _check_wrapper_order(
+        self, appended: np.ndarray, reward: np.ndarray, vector_rewards: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        """Observations must end in the w, and rewards be the w.r, that PreferenceWrapper reports."""
+        w = np.stack([info["preference"] for info in infos])
+        products = w * vector_rewards
+        tolerance = SCALARISATION_TOLERANCE * (1 + np.abs(products).sum(axis=1))
+        if self.preference_dim > 0 and not np.array_equal(appended, w):
+            what = f"The observations end in {appended.tolist()}, not in the preferences {w.tolist()}"
+        elif (np.abs(reward - products.sum(axis=1)) > tolerance).any():
+            what = f"The rewards {np.asarray(reward).tolist()} are not the scalarised {products.sum(axis=1).tolist()}"
+        else:
             return
-        products = vector_rewards * [info["preference"] for info in infos]
-        scale = np.abs(products).sum(axis=1)
-        if (np.abs(reward - products.sum(axis=1)) > SCALARISATION_TOLERANCE * (1 + scale)).any():
-            raise ValueError(
-                f"The rewards {np.asarray(reward).tolist()} are not the scalarised {products.sum(axis=1).tolist()}: a wrapper "
-                "outside PreferenceWrapper changes them. Put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
-            )
+        raise ValueError(
+            f"{what}: a wrapper outside PreferenceWrapper changes them (put it inside, as in "
+            "Monitor(PreferenceWrapper(YourWrapper(env)))), or the environment was stepped or reset outside learn() (use "
+            "another one to evaluate, or model.set_env(env) before going on)."
+        )
 
     @property
     def latest_rewards(self) -> np.ndarray:
@@ -240,16 +259,3 @@ class PreferenceReplayBuffer(ReplayBuffer):
         total = relabelled.sum(axis=1, keepdims=True)
         keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None] | (total == 0)
         return np.where(keep, preferences, relabelled / np.where(total == 0, 1, total)).astype(np.float32)
-
-
-def _check_memory(buffer_size: int, numbers: int) -> None:
-    """
-    :param numbers: float32 numbers per transition
-    :raises MemoryError: if the buffer cannot fit into this machine's memory once it is full
-    """
-    needed, available = 4 * numbers * buffer_size, psutil.virtual_memory().available
-    if needed > available:
-        raise MemoryError(
-            f"A replay buffer of buffer_size={buffer_size:,} transitions grows to {needed / 1e9:.1f} GB, and "
-            f"{available / 1e9:.1f} GB are free: choose buffer_size={int(0.8 * available / needed * buffer_size):,} or less."
-        )

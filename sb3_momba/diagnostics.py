@@ -47,6 +47,32 @@ class TrainingMetrics:
         self.sums, self.count = {}, 0
 
 
+class NegativeReturnWatch:
+    """Warns once of the first episode whose undiscounted return is negative in an objective: eq. (3.21) assumes none."""
+
+    def __init__(self) -> None:
+        self.returns: np.ndarray | None = None
+        self.warned = False
+
+    def add(self, rewards: np.ndarray, dones: np.ndarray) -> None:
+        """
+        :param rewards: (n_envs, n_objectives)
+        :param dones: where an episode has just ended, (n_envs,)
+        """
+        if self.returns is None or self.returns.shape != rewards.shape:
+            self.returns = np.zeros(rewards.shape)
+        self.returns += rewards
+        ended = dones.astype(bool)
+        if not self.warned and (self.returns[ended] < 0).any():
+            self.warned = True
+            warnings.warn(
+                "preference_alignment assumes returns that are not negative (section 3.5.2): the cosine of eq. (3.21) steers "
+                f"the wrong way where they are. An episode has just returned {self.returns[ended].min(axis=0).tolist()}.",
+                stacklevel=2,
+            )
+        self.returns[ended] = 0
+
+
 def weight_norm(network: nn.Module) -> float:
     """The l2 norm of all parameters together."""
     return float(th.stack([p.detach().square().sum() for p in network.parameters()]).sum().sqrt())

@@ -131,6 +131,14 @@ def read_tree(path: FilePath) -> tuple[Any, list[str]]:
         raise FileFormatError(f"{name} is damaged, or not a file of sb3_momba: {type(error).__name__}: {error}") from error
 
 
+def with_suffix(path: FilePath, suffix: str) -> FilePath:
+    """SB3's habit: a name without a suffix gets one."""
+    if isinstance(path, io.IOBase):
+        return path
+    path = Path(path)  # type: ignore[arg-type]
+    return path if path.suffix else path.with_name(path.name + suffix)
+
+
 class _Encoder:
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}

@@ -1,7 +1,6 @@
 """MOMBA: preference-conditioned maximum-entropy actor-critic with SimbaV2 networks and distributional critics."""
 
 import logging
-import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_momba.acting import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
-from sb3_momba.diagnostics import Metrics, TrainingMetrics, weight_norm
+from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.nn.distributional import lowest
@@ -172,12 +171,13 @@ class MOMBA(PreferenceConditionedAlgorithm):
             self.observation_space,
             self.action_space,
             self.lr_schedule,
-            **{**self._injected_policy_kwargs(), **self.policy_kwargs},
+            **self._injected_policy_kwargs(),
+            **self.policy_kwargs,
         ).to(self.device)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         self._setup_entropy_coefficient()
         self._metrics = TrainingMetrics()
-        self._warned_negative = False
+        self._negative_returns = NegativeReturnWatch()
         self._skipped_updates = 0
 
     def _check_settings(self) -> None:
@@ -197,6 +197,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
             raise ValueError("her and preference_alignment need two objectives or more: with one there is no preference.")
         if self.her_kwargs is not None and not self.her:
             raise ValueError(f"her_kwargs={self.her_kwargs} without her=True: set her=True, or leave them out.")
+        doubled = sorted(set(self.policy_kwargs) & set(self._injected_policy_kwargs()))
+        if doubled:
+            raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
         for name, known in CHOICES.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}={getattr(self, name)!r} is not known: use one of {', '.join(known)}.")
@@ -262,14 +265,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
         observations = self._last_obs[:, : self.policy.observation_dim]
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
-        finished = self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
-        if self.preference_alignment and not self._warned_negative and (finished < 0).any():
-            self._warned_negative = True
-            warnings.warn(
-                "preference_alignment assumes returns that are not negative (section 3.5.2): the cosine of eq. (3.21) steers "
-                f"the wrong way where they are. An episode has just returned {finished.min(axis=0).tolist()}, discounted.",
-                stacklevel=2,
-            )
+        self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
+        if self.preference_alignment:
+            self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
 
     # -------------------------------------------------------------------------------------------------- learning
 
@@ -403,12 +401,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
     # ---------------------------------------------------------------------------------------------------- saving
 
     def _excluded_save_params(self) -> list[str]:
-        derived = ["actor", "critic", "critic_target", "lr_schedule", "_metrics"]
+        derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor", "_metrics", "_negative_returns"]
         return [*super()._excluded_save_params(), *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         if self.ent_coef_optimizer is None:
-            return ["policy", "actor.optimizer", "critic.optimizer"], ["ent_coef_tensor"]
+            return ["policy", "actor.optimizer", "critic.optimizer"], []
         return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
 
 

@@ -74,10 +74,10 @@ class MombaPolicy(BasePolicy):
         self.return_scale = ReturnScale(best_return_scale, gamma)
         self.value = DistributionalValue(*support, n_atoms) if critic_loss == "ce" else ExpectedValue()
         action_dim = int(action_space.shape[0])
-        self.actor = Actor(actor_architecture, self.observation_dim, self.preference_dim, action_dim)
-        if capql_log_prob:
-            scale = th.as_tensor((action_space.high - action_space.low) / 2, dtype=th.float32)
-            self.actor.register_buffer("action_scale", scale)
+        half_width = th.as_tensor((action_space.high - action_space.low) / 2, dtype=th.float32)
+        self.actor = Actor(
+            actor_architecture, self.observation_dim, self.preference_dim, action_dim, half_width if capql_log_prob else None
+        )
         self.critic = Critic(
             critic_architecture,
             self.observation_dim,
@@ -111,6 +111,15 @@ class MombaPolicy(BasePolicy):
         if self.normalize_weights:
             project_weights(self.actor)
             project_weights(self.critic)
+
+    def save(self, path: str) -> None:
+        """Policies are saved with their model, without pickle."""
+        raise NotImplementedError("Save the model instead: model.save(path); MOMBA.load(path).policy brings the policy back.")
+
+    @classmethod
+    def load(cls, path: str, device: th.device | str = "auto") -> "MombaPolicy":
+        """Policies are loaded with their model, without pickle."""
+        raise NotImplementedError("Load the model instead: MOMBA.load(path).policy.")
 
     def forward(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)

@@ -21,10 +21,10 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_momba.buffers import PreferenceReplayBuffer
+from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
 from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler
 from sb3_momba.envs.wrappers import n_objectives_of
-from sb3_momba.files import FileFormatError, FilePath, read_tree, register, write_tree
+from sb3_momba.files import FileFormatError, FilePath, read_tree, register, with_suffix, write_tree
 from sb3_momba.policies import MombaPolicy
 
 FORMAT_VERSION = 1
@@ -159,7 +159,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             "versions": library_versions(),
             **{name: getattr(buffer, name) for name in ("n_envs", "n_objectives", "buffer_size", "pos", "full")},
             "rng": buffer.rng.bit_generator.state,
-            "arrays": {name: getattr(buffer, name)[: buffer.size()] for name in BUFFER_ARRAYS},
+            "arrays": {name: getattr(buffer, name)[: buffer.size()] for name in STORED_ARRAYS},
         }
         write_tree(with_suffix(path, ".npz"), tree)
 
@@ -173,7 +173,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         self._check_buffer_fits(tree)
         self.buffer_size = tree["buffer_size"] * tree["n_envs"]
         buffer = self._make_replay_buffer()
-        for name in BUFFER_ARRAYS:
+        for name in STORED_ARRAYS:
             array = tree["arrays"][name]
             getattr(buffer, name)[: len(array)] = array
         buffer.pos, buffer.full = tree["pos"], tree["full"]
@@ -190,18 +190,17 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         for name in ("n_objectives", "n_envs"):
             if tree[name] != getattr(ours, name):
                 raise ValueError(f"The file's buffer has {name}={tree[name]}, this model has {name}={getattr(ours, name)}.")
-        for name in BUFFER_ARRAYS:
+        for name in STORED_ARRAYS:
             theirs, mine = tree["arrays"][name].shape[1:], getattr(ours, name).shape[1:]
             if theirs != mine:
                 raise ValueError(f"The file's {name} have shape {theirs}, this model's {mine}: another environment?")
         size = tree["buffer_size"] if tree["full"] else tree["pos"]
-        if any(len(tree["arrays"][name]) != size for name in BUFFER_ARRAYS) or not 0 <= tree["pos"] < tree["buffer_size"]:
+        if any(len(tree["arrays"][name]) != size for name in STORED_ARRAYS) or not 0 <= tree["pos"] < tree["buffer_size"]:
             raise FileFormatError("The file's arrays do not have the length that it states.")
 
 
 # What an argument of a model that is a class may be.
 CLASSES_AT = {"policy_class": MombaPolicy, "replay_buffer_class": PreferenceReplayBuffer}
-BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
 
 
 def library_versions() -> dict[str, str]:
@@ -252,14 +251,6 @@ def pickled_by_sb3(path: FilePath) -> bool:
     with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
         names = archive.namelist()
     return "_stable_baselines3_version" in names and "tree.json" not in names
-
-
-def with_suffix(path: FilePath, suffix: str) -> FilePath:
-    """SB3's habit: a name without a suffix gets one."""
-    if isinstance(path, io.IOBase):
-        return path
-    path = Path(path)  # type: ignore[arg-type]
-    return path if path.suffix else path.with_name(path.name + suffix)
 
 
 def with_existing_suffix(path: FilePath, suffix: str) -> FilePath:

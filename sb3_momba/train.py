@@ -168,11 +168,11 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     return RunSettings(
         env=given.env,
         output=given.output or f"runs/{given.env}/{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
-        steps=given.steps or configuration.n_timesteps or 1_000_000,
+        steps=first_given(given.steps, configuration.n_timesteps, 1_000_000),
         seed=given.seed,
         policy=ARCHITECTURES[given.architecture] if given.architecture else configuration.policy,
         hyperparameters=hyperparameters,
-        n_envs=given.n_envs or configuration.n_envs,
+        n_envs=first_given(given.n_envs, configuration.n_envs),
         subprocesses=given.subprocesses,
         eval_freq=given.eval_freq,
         n_preferences=given.n_preferences,
@@ -182,6 +182,11 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         device=given.device,
         progress_bar=not given.no_progress_bar,
     )
+
+
+def first_given(*values: int | None) -> int:
+    """The first value that is not None."""
+    return next(value for value in values if value is not None)
 
 
 def assign(hyperparameters: dict[str, Any], assignment: str) -> None:

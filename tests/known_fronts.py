@@ -69,7 +69,7 @@ class LinearQuadraticRegulator(gym.Env[np.ndarray, np.ndarray]):
 
     def __init__(self) -> None:
         self.observation_space = spaces.Box(-5, 5, (2,), np.float32)
-        self.action_space = spaces.Box(-2, 2, (1,), np.float32)
+        self.action_space = spaces.Box(-3, 3, (1,), np.float32)
         self.reward_space = spaces.Box(-np.inf, 0, (2,))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -79,7 +79,7 @@ class LinearQuadraticRegulator(gym.Env[np.ndarray, np.ndarray]):
         return self.x.astype(np.float32), {}
 
     def step(self, action: np.ndarray):
-        u = np.clip(np.asarray(action, dtype=np.float64), -2, 2)
+        u = np.clip(np.asarray(action, dtype=np.float64), -3, 3)
         reward = -(np.einsum("i,oij,j->o", self.x, self.q_matrices, self.x) + np.einsum("i,oij,j->o", u, self.r_matrices, u))
         self.x = self.a_matrix @ self.x + self.b_matrix @ u
         self.t += 1

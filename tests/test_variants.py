@@ -358,7 +358,7 @@ def test_a_run_leaves_its_folder(tmp_path, capsys) -> None:
     front = ParetoFront.load(folder / "front.npz")
     assert front.hypervolume() == hypervolumes[-1]
     with open(folder / "progress.csv") as file:
-        assert {"pareto/hypervolume", "train/critic_loss"} <= set(csv.DictReader(file).fieldnames or ())
+        assert {"pareto/hypervolume", "pareto/preference_regret"} <= set(csv.DictReader(file).fieldnames or ())
     assert MOMBA.load(folder / "model.zip").num_timesteps == 120
     assert str(folder / "front.png") in capsys.readouterr().out
 

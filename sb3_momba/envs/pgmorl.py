@@ -2,30 +2,29 @@
 Reinforcement Learning for Continuous Robot Control).
 
 `gymnasium.make("MO-Hopper-v4", physics="2020")`, once this module is imported. The models are those that Gymnasium ships,
-edited as each class says. `physics="2020"`, the default, undoes what MuJoCo changed since the published fronts were made
-and is the same on every release; `physics="current"` takes the model as the installed MuJoCo compiles it.
+edited as each class says. `physics="2020"`, the default, undoes what changed since the published fronts were made, on every
+MuJoCo release from 3.2 on; `physics="current"` takes the model as the installed MuJoCo compiles it. Releases still differ in
+their solvers and, since 4.0, in how RK4 turns the free bodies of Ant and Humanoid, by 1e-11 to 1e-7 per step.
 """
 
 from typing import Any, ClassVar
 
 import gymnasium as gym
-import mujoco
+import mujoco  # type: ignore[import-untyped]
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
-from sb3_momba.envs.pgmorl_physics import check_physics, compile_model, set_damping
-
-CLIPPED_VELOCITY = 10.0
+from sb3_momba.envs.pgmorl_physics import check_physics, compile_model, driven_joints, set_damping
 
 
 class PgmorlEnv(MujocoEnv, EzPickle):
     """What the tasks share: the reward is a float64 vector, one entry per objective; a is the action clipped to its range,
     x, z and angle are qpos[0:3] of the planar bodies, and v is the change of x over one step, divided by its time `dt`.
 
-    The first state is that of the model, at rest. `info` holds the position and velocity along the axes that count (m,
-    m/s) and `energy`, the sum of a^2.
+    An episode starts in the model's own state, at rest. `info` holds `x_position` and `x_velocity`, `y_position` and
+    `y_velocity` where y counts (m, m/s), `z_position` but for the Swimmer, and `energy`, the sum of a^2.
 
     :param physics: "2020" or "current"
     :param kwargs: of `gymnasium.envs.mujoco.MujocoEnv`: render_mode, width, height, camera_id, camera_name,
@@ -37,8 +36,11 @@ class PgmorlEnv(MujocoEnv, EzPickle):
     frames_per_step: ClassVar[int]
     objectives: ClassVar[tuple[str, ...]]
     camera: ClassVar[dict[str, Any]]
+    height_index: ClassVar[int | None] = 1
+    unseen_positions: ClassVar[int] = 1
+    largest_velocity: ClassVar[float] = np.inf
     deterministic: ClassVar[bool] = True
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array", "depth_array"]}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
 
     def __init__(self, physics: str = "2020", **kwargs: Any):
         EzPickle.__init__(self, physics, **kwargs)
@@ -46,7 +48,7 @@ class PgmorlEnv(MujocoEnv, EzPickle):
         self.physics = physics
         kwargs = {"default_camera_config": self.camera, **kwargs}
         MujocoEnv.__init__(self, self.model_file, self.frames_per_step, observation_space=None, **kwargs)
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}  # type: ignore[misc]
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
         self.observation_space = Box(-np.inf, np.inf, self._observe().shape, np.float64)
         self.reward_space = Box(-np.inf, np.inf, (len(self.objectives),), np.float64)
 
@@ -70,18 +72,20 @@ class PgmorlEnv(MujocoEnv, EzPickle):
         velocity = (self._position() - before) / self.dt
         energy = float(np.square(a).sum())
         reward = np.array(self._rewards(velocity, energy))
-        info = self._get_reset_info()
-        info.update({f"{axis}_velocity": float(v) for axis, v in zip("xy", velocity, strict=False)}, energy=energy)
+        info = {**self._get_reset_info(), **_along_axes("velocity", velocity), "energy": energy}
         if self.render_mode == "human":
-            self.render()
+            self.render()  # type: ignore[no-untyped-call]
         return self._observe(), reward, not self.is_healthy, False, info
 
     def reset_model(self) -> np.ndarray:
-        self.set_state(self.init_qpos, self.init_qvel)
+        self.set_state(self.init_qpos, self.init_qvel)  # type: ignore[no-untyped-call]
         return self._observe()
 
     def _get_reset_info(self) -> dict[str, float]:
-        return {f"{axis}_position": float(p) for axis, p in zip("xy", self._position(), strict=False)}
+        info = _along_axes("position", self._position())
+        if self.height_index is not None:
+            info["z_position"] = float(self.data.qpos[self.height_index])
+        return info
 
     @property
     def is_healthy(self) -> bool:
@@ -97,12 +101,17 @@ class PgmorlEnv(MujocoEnv, EzPickle):
         return self.data.qpos[:1].copy()
 
     def _observe(self) -> np.ndarray:
-        """By default all but x; a fresh array."""
-        return np.concatenate([self.data.qpos[1:], self.data.qvel])
+        """qpos without its first entries, and qvel clipped; a fresh array."""
+        qvel = np.clip(self.data.qvel, -self.largest_velocity, self.largest_velocity)
+        return np.concatenate([self.data.qpos[self.unseen_positions :], qvel])
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         """One reward per objective, after the step."""
         raise NotImplementedError
+
+
+def _along_axes(quantity: str, values: np.ndarray) -> dict[str, float]:
+    return {f"{axis}_{quantity}": float(value) for axis, value in zip("xy", values, strict=False)}
 
 
 class MOAnt(PgmorlEnv):
@@ -118,6 +127,8 @@ class MOAnt(PgmorlEnv):
 
     model_file = "ant.xml"
     frames_per_step = 5
+    height_index = 2
+    unseen_positions = 2
     objectives = ("x-axis speed", "y-axis speed")
     camera: ClassVar = {"distance": 4.0}
 
@@ -133,9 +144,6 @@ class MOAnt(PgmorlEnv):
     def _position(self) -> np.ndarray:
         # Not qpos: xpos is that of the last intermediate state of the integrator.
         return self.data.body("torso").xpos[:2].copy()
-
-    def _observe(self) -> np.ndarray:
-        return np.concatenate([self.data.qpos[2:], self.data.qvel])
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         s = 1 - 0.5 * energy
@@ -179,6 +187,7 @@ class MOHopper(PgmorlEnv):
 
     model_file = "hopper.xml"
     frames_per_step = 5
+    largest_velocity = 10.0
     objectives: ClassVar[tuple[str, ...]] = ("forward speed", "jumping height")
     camera: ClassVar = {"trackbodyid": 2, "distance": 3.0, "lookat": (0.0, 0.0, 1.15), "elevation": -20.0}
 
@@ -187,16 +196,13 @@ class MOHopper(PgmorlEnv):
         for actuator, gear, bound in zip(spec.actuators, (200, 200, 300), (2, 2, 4), strict=True):
             actuator.gear[0] = gear
             actuator.ctrlrange = [-bound, bound]
-            joint = spec.joint(actuator.target)
+        for joint in driven_joints(spec):
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             set_damping(joint, 40)
 
     @property
     def is_healthy(self) -> bool:
         return bool(self.data.qpos[1] > 0.4 and (np.abs(self.data.qpos[2:6]) < np.deg2rad(90)).all())
-
-    def _observe(self) -> np.ndarray:
-        return np.concatenate([self.data.qpos[1:], np.clip(self.data.qvel, -CLIPPED_VELOCITY, CLIPPED_VELOCITY)])
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         s = 1 - 2e-4 * energy
@@ -233,6 +239,8 @@ class MOHumanoid(PgmorlEnv):
 
     model_file = "humanoid.xml"
     frames_per_step = 5
+    height_index = 2
+    unseen_positions = 2
     objectives = ("forward speed", "energy efficiency")
     camera: ClassVar = {"trackbodyid": 1, "distance": 4.0, "lookat": (0.0, 0.0, 2.0), "elevation": -20.0}
     deterministic = False
@@ -245,7 +253,7 @@ class MOHumanoid(PgmorlEnv):
     def reset_model(self) -> np.ndarray:
         qpos = self.init_qpos + self.np_random.uniform(-self.reset_noise, self.reset_noise, self.model.nq)
         qvel = self.init_qvel + self.np_random.uniform(-self.reset_noise, self.reset_noise, self.model.nv)
-        self.set_state(qpos, qvel)
+        self.set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         return self._observe()
 
     def _position(self) -> np.ndarray:
@@ -255,9 +263,8 @@ class MOHumanoid(PgmorlEnv):
 
     def _observe(self) -> np.ndarray:
         data = self.data
-        contact_forces = np.zeros(data.cfrc_ext.size) if self.physics == "2020" else data.cfrc_ext.ravel()
-        parts = (data.qpos[2:], data.qvel, data.cinert.ravel(), data.cvel.ravel(), data.qfrc_actuator, contact_forces)
-        return np.concatenate(parts)
+        forces = np.zeros(data.cfrc_ext.size) if self.physics == "2020" else data.cfrc_ext.ravel()
+        return np.concatenate([super()._observe(), data.cinert.ravel(), data.cvel.ravel(), data.qfrc_actuator, forces])
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         return 1.25 * velocity[0] + 3, 3 - 4 * energy + 3
@@ -275,6 +282,8 @@ class MOSwimmer(PgmorlEnv):
 
     model_file = "swimmer.xml"
     frames_per_step = 4
+    height_index = None
+    unseen_positions = 2
     objectives = ("forward speed", "energy efficiency")
     camera: ClassVar = {"distance": 4.0}
 
@@ -283,9 +292,6 @@ class MOSwimmer(PgmorlEnv):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         for actuator in spec.actuators:
             actuator.gear[0] = 300
-
-    def _observe(self) -> np.ndarray:
-        return np.concatenate([self.data.qpos[2:], self.data.qvel])
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         return velocity[0], 0.3 - 0.15 * energy
@@ -304,6 +310,7 @@ class MOWalker2d(PgmorlEnv):
 
     model_file = "walker2d.xml"
     frames_per_step = 4
+    largest_velocity = 10.0
     objectives = ("forward speed", "energy efficiency")
     camera: ClassVar = {"trackbodyid": 2, "distance": 4.0, "lookat": (0.0, 0.0, 1.15), "elevation": -20.0}
 
@@ -311,16 +318,13 @@ class MOWalker2d(PgmorlEnv):
     def _edit(spec: mujoco.MjSpec) -> None:
         for geom in spec.geoms:
             geom.density = 1500
-        for actuator in spec.actuators:
-            set_damping(spec.joint(actuator.target), 3)
+        for joint in driven_joints(spec):
+            set_damping(joint, 3)
 
     @property
     def is_healthy(self) -> bool:
         z, angle = self.data.qpos[1:3]
         return bool(0.8 < z < 2.0 and abs(angle) < 1)
-
-    def _observe(self) -> np.ndarray:
-        return np.concatenate([self.data.qpos[1:], np.clip(self.data.qvel, -CLIPPED_VELOCITY, CLIPPED_VELOCITY)])
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         return velocity[0] + 1, 4 - energy + 1

@@ -4,7 +4,7 @@ The published fronts of these tasks come from the MuJoCo of 2020, where two rule
 of capsules, and the margin at which two geoms touch. Together they move hypervolumes by up to 4 %.
 """
 
-import mujoco
+import mujoco  # type: ignore[import-untyped]
 import numpy as np
 
 PHYSICS = ("2020", "current")
@@ -64,6 +64,12 @@ def sums_margins() -> bool:
     """Whether the installed MuJoCo adds the margins of two geoms (since 3.5.0), or takes the larger one."""
     major, minor = mujoco.__version__.split(".")[:2]
     return (int(major), int(minor)) >= (3, 5)
+
+
+def driven_joints(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
+    """The joints with a motor."""
+    names = {actuator.target for actuator in spec.actuators}
+    return [joint for joint in spec.joints if joint.name in names]
 
 
 def set_damping(joint: mujoco.MjsJoint, damping: float) -> None:

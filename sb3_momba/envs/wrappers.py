@@ -9,7 +9,7 @@ import mo_gymnasium  # noqa: F401  registers its environments' ids
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_momba.envs.preferences import PreferenceSampler, UniformSampler, check_preference, preference_dim
 
@@ -81,9 +81,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._fixed_preference = None if preference is None else self._one_preference(preference)
         self._holds_for_episode = self._holds_for_episode and preference is None
 
-    def set_preference_sampler(self, sampler: PreferenceSampler | None) -> None:
-        """Draw preferences with `sampler` from the next draw on; None: uniform on the simplex."""
-        self.preference_sampler = sampler or UniformSampler(self.n_objectives)
+    def set_preference_sampler(self, sampler: PreferenceSampler | CloudpickleWrapper | None) -> None:
+        """Draw preferences with `sampler` from the next draw on; None: uniform on the simplex.
+
+        :param sampler: or SB3's wrapper around it, which takes any callable into subprocesses
+        """
+        own = sampler.var if isinstance(sampler, CloudpickleWrapper) else sampler
+        self.preference_sampler = own or UniformSampler(self.n_objectives)
 
     def set_env_index(self, index: int) -> None:
         """The environment's place in its VecEnv, for error messages."""
@@ -227,10 +231,18 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         )
 
 
-def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None) -> gym.Env:
+def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode: str | None = None) -> gym.Env:
     """An environment from its id, from a callable, or itself. Ids are made without Gymnasium's checker, which does not
-    know vector rewards."""
+    know vector rewards.
+
+    :param render_mode: for an id, where its environment takes one
+    """
     if isinstance(env, str):
+        if render_mode is not None:
+            try:
+                return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
+            except TypeError:
+                pass
         return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
     if isinstance(env, gym.Env):
         if env_kwargs:

@@ -163,14 +163,23 @@ class Actor(nn.Module):
     """pi(a | s, w): a Gaussian squashed by tanh onto [-1, 1].
 
     Observations are [normalised s, w], shape (batch, observation_dim + preference_dim).
+
+    :param action_scale: half the width of the action's bounds, (action_dim,), for log pi as CAPQL's code has it
     """
 
     optimizer: th.optim.Optimizer
-    action_scale: th.Tensor | None  # half the width of the action's bounds, where CAPQL's log pi is asked for
+    action_scale: th.Tensor | None
 
-    def __init__(self, architecture: Architecture, observation_dim: int, preference_dim: int, action_dim: int):
+    def __init__(
+        self,
+        architecture: Architecture,
+        observation_dim: int,
+        preference_dim: int,
+        action_dim: int,
+        action_scale: th.Tensor | None = None,
+    ):
         super().__init__()
-        self.register_buffer("action_scale", None)
+        self.register_buffer("action_scale", action_scale)
         self.observation_dim = observation_dim
         self.trunk = architecture.trunk(observation_dim + preference_dim, preference_dim, None)
         self.mean_head = architecture.head(self.trunk.features_dim, action_dim, None)

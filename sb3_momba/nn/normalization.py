@@ -47,11 +47,12 @@ class RunningStatistics(nn.Module):
 
 
 class ReturnScale(nn.Module):
-    """Rewards are multiplied by best_return_scale / max |G_i|, the largest discounted return of any objective so far
-    (reward normalisation, section 3.4.1).
+    """Rewards are multiplied by best_return_scale / max |G_i|, the largest running return of any objective so far (reward
+    normalisation, section 3.4.1).
 
     G <- gamma G + r runs along each episode of each environment. max_i |G_i| bounds |w.G| for every preference w, so one
-    rule serves the scalarised and the vector critic.
+    rule serves the scalarised and the vector critic. (G weighs an episode's end most; the return that critics learn weighs
+    its beginning most, and can exceed it.)
 
     :param best_return_scale: what the best return becomes (Table B.1: 3.0), or None: rewards stay as they are
     """
@@ -65,20 +66,16 @@ class ReturnScale(nn.Module):
         self.register_buffer("max_return", th.zeros((), dtype=th.float64))
         self.running_returns: np.ndarray | None = None
 
-    def update(self, rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
+    def update(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """
         :param rewards: (n_envs, n_objectives)
         :param dones: where an episode has just ended, (n_envs,)
-        :return: G of those episodes, (n_ended, n_objectives)
         """
         if self.running_returns is None or self.running_returns.shape != rewards.shape:
             self.running_returns = np.zeros(rewards.shape, dtype=np.float64)
         self.running_returns = self.gamma * self.running_returns + rewards
         self.max_return.fill_(max(float(self.max_return), float(np.abs(self.running_returns).max())))
-        ended = dones.astype(bool)
-        finished = self.running_returns[ended]
-        self.running_returns[ended] = 0.0
-        return finished
+        self.running_returns[dones.astype(bool)] = 0.0
 
     def end_episodes(self) -> None:
         """The next rewards begin new returns, in any number of environments."""

@@ -17,7 +17,8 @@ from sb3_momba.pareto.plotting import plot_front
 
 
 class ParetoEvalCallback(EventCallback):
-    """Evaluate the front every `eval_freq` environment steps and at the end of the training.
+    """Evaluate the front every `eval_freq` environment steps and at the end of the training, each time after the updates
+    that belong to those steps.
 
     Records `pareto/hypervolume`, `pareto/expected_utility`, `pareto/preference_regret` and `pareto/n_non_dominated`, and
     the front's picture where the logger takes figures. `last_mean_reward` and `best_mean_reward` are hypervolumes, so
@@ -46,7 +47,7 @@ class ParetoEvalCallback(EventCallback):
         callback_on_new_best: BaseCallback | None = None,
         callback_after_eval: BaseCallback | None = None,
         objectives: list[str] | None = None,
-        verbose: int = 1,
+        verbose: int = 0,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
         if eval_freq < 1:
@@ -73,22 +74,32 @@ class ParetoEvalCallback(EventCallback):
 
     def _init_callback(self) -> None:
         self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
+        self.go_on = True
+        self.is_evaluated = False  # whether the model of this moment is
+        if self.eval_env is self.training_env:
+            raise ValueError("eval_env is the training environment, whose episodes an evaluation would end: give it its own.")
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.parent = self
             self.callback_on_new_best.init_callback(self.model)
 
+    def _on_rollout_start(self) -> None:
+        # Only here have the last transition and the updates that follow it been made.
+        if self.model.num_timesteps >= self.next_evaluation:
+            self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
+            self.go_on = self._evaluate()
+
     def _on_step(self) -> bool:
-        if self.num_timesteps < self.next_evaluation:
-            return True
-        self.next_evaluation = (self.num_timesteps // self.eval_freq + 1) * self.eval_freq
-        return self._evaluate()
+        self.is_evaluated = self.is_evaluated and not self.go_on
+        return self.go_on
 
     def _on_training_end(self) -> None:
-        if not self.timesteps or self.timesteps[-1] != self.model.num_timesteps:
-            self.num_timesteps = self.model.num_timesteps
+        if not self.is_evaluated:
             self._evaluate()
 
     def _evaluate(self) -> bool:
+        """Measure, log and write the front; False where a callback wants the training to stop."""
+        self.num_timesteps = self.model.num_timesteps
+        self.is_evaluated = True
         self.front = front = evaluate_front(self.model, self.eval_env, **self.evaluation_kwargs)  # type: ignore[arg-type]
         measured = {
             "hypervolume": front.hypervolume(self.reference_point),
@@ -100,9 +111,11 @@ class ParetoEvalCallback(EventCallback):
         self.metrics.append(measured)
         self.values.append(front.values)
         self.last_mean_reward = measured["hypervolume"]
-        self._log(front, measured)
+        if self.verbose >= 1:
+            print(f"Front at {self.num_timesteps:,} steps:", ", ".join(f"{k} {v:,.6g}" for k, v in measured.items()))
         if self.log_path is not None:
             self._write(front)
+        self._log(front, measured)
 
         continue_training = True
         if self.last_mean_reward > self.best_mean_reward:
@@ -119,19 +132,19 @@ class ParetoEvalCallback(EventCallback):
         for name, value in measured.items():
             self.logger.record(f"pareto/{name}", value)
         if front.n_objectives in (2, 3):
-            picture = plot_front(front, objectives=self.objectives, title=f"{self.num_timesteps:,} steps")
-            self.logger.record("pareto/front", LoggedFigure(picture, close=True), exclude=("stdout", "log", "json", "csv"))
-        self.model.dump_logs()
+            title = f"{front.settings['env']}, {self.num_timesteps:,} steps"
+            path = None if self.log_path is None else self.log_path / "front.png"
+            picture = LoggedFigure(plot_front(front, path, self.objectives, title), close=True)
+            self.logger.record("pareto/front", picture, exclude=("stdout", "log", "json", "csv"))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
 
     def _write(self, front: ParetoFront) -> None:
         assert self.log_path is not None
         front.save(self.log_path / "front.npz")
-        if front.n_objectives in (2, 3):
-            title = f"{front.settings['env']}, {self.num_timesteps:,} steps"
-            plot_front(front, self.log_path / "front.png", self.objectives, title)
+        arrays = {name: np.array([m[name] for m in self.metrics]) for name in self.metrics[0]}
+        arrays["timesteps"] = np.array(self.timesteps)
+        arrays["preferences"] = front.preferences
+        arrays["values"] = np.stack(self.values)  # (evaluations, P, n_objectives)
         with atomic_write(self.log_path / "pareto_evaluations.npz") as file:
-            arrays = {name: np.array([m[name] for m in self.metrics]) for name in self.metrics[0]}
-            arrays["timesteps"] = np.array(self.timesteps)
-            arrays["preferences"] = front.preferences
-            arrays["values"] = np.stack(self.values)  # (evaluations, P, n_objectives)
             np.savez(file, allow_pickle=False, **arrays)

@@ -1,18 +1,18 @@
 """Rolling out a policy under a grid of preferences (section 4.1.2)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from numpy.typing import ArrayLike, NDArray
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
-from sb3_momba.files import FileFormatError, FilePath, read_tree, write_tree
+from sb3_momba.files import FileFormatError, FilePath, read_tree, with_suffix, write_tree
 from sb3_momba.pareto import metrics
 
 MAX_PARALLEL_EPISODES = 128
@@ -70,8 +70,8 @@ class ParetoFront:
         return metrics.preference_regret(self.values, self.preferences)
 
     def save(self, path: FilePath) -> None:
-        """Write one file, atomically and without pickle."""
-        write_tree(path, {"format": FRONT_FORMAT, **vars(self)})
+        """Write one file, ".npz" appended if it has no suffix, atomically and without pickle."""
+        write_tree(with_suffix(path, ".npz"), {"format": FRONT_FORMAT, **vars(self)})
 
     @classmethod
     def load(cls, path: FilePath) -> "ParetoFront":
@@ -79,6 +79,9 @@ class ParetoFront:
         tree, _ = read_tree(path)
         if not isinstance(tree, dict) or tree.pop("format", None) != FRONT_FORMAT:
             raise FileFormatError(f"{path} holds no Pareto front.")
+        names = {field.name for field in fields(cls)}
+        if set(tree) != names:
+            raise FileFormatError(f"{path} holds {sorted(tree)}, not what a Pareto front has: {sorted(names)}.")
         return cls(**tree)
 
 
@@ -186,6 +189,8 @@ def _probe(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict
     """What must be known of an environment before it is copied."""
     if isinstance(env, VecEnv):
         check_vec_env(env)
+        if is_vecenv_wrapped(env, VecNormalize):
+            raise ValueError("VecNormalize scales rewards, which are no returns then: give the environment without it.")
         spec = env.get_attr("spec", indices=[0])[0]
         deterministic = env.has_attr("deterministic") and all(env.get_attr("deterministic"))
         return _Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic))

@@ -10,14 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-def as_points(values: ArrayLike, name: str = "values") -> Array:
-    """Value vectors as a finite float64 (n, n_objectives) array.
+def as_points(values: ArrayLike, name: str = "values", at_least: int = 0) -> Array:
+    """Value vectors as a finite float64 (n, n_objectives) array of at least so many rows.
 
     :raises ValueError: naming the array and its shape
     """
     points = np.asarray(values, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] == 0:
         raise ValueError(f"{name} has shape {points.shape}: give (n, n_objectives).")
+    if len(points) < at_least:
+        raise ValueError(f"{name} has no rows: give at least {at_least}.")
     if not np.isfinite(points).all():
         raise ValueError(f"{name} has an entry that is not finite.")
     return points
@@ -32,6 +34,8 @@ def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
     reference = np.asarray(reference_point, dtype=np.float64)
     if reference.shape != (points.shape[1],):
         raise ValueError(f"The reference point {reference_point!r} has shape {reference.shape}, not ({points.shape[1]},).")
+    if not np.isfinite(reference).all():
+        raise ValueError(f"The reference point {reference_point!r} is not finite.")
     points = points[(points > reference).all(axis=1)]
     if len(points) == 0:
         return 0.0
@@ -62,7 +66,7 @@ def inverted_generational_distance(values: ArrayLike, reference_front: ArrayLike
 
     Objectives of different units should be normalised first (section 4.4: the front's range to [0, 1]).
     """
-    points, front = as_points(values), as_points(reference_front, "reference_front")
+    points, front = as_points(values, at_least=1), as_points(reference_front, "reference_front", at_least=1)
     if points.shape[1] != front.shape[1]:
         raise ValueError(f"values have {points.shape[1]} objectives, the reference front {front.shape[1]}.")
     return float(moocore.igd(points, ref=front, maximise=True))
@@ -72,15 +76,14 @@ def non_dominated(values: ArrayLike) -> NDArray[np.bool_]:
     """Which values no other value exceeds in one objective without falling behind in another, (n,); of equal ones the first."""
     points = as_points(values)
     if points.shape[1] == 1:
-        mask = np.zeros(len(points), dtype=bool)
-        mask[points[:, 0].argmax()] = True
-        return mask
+        first_best = points.argmax() if len(points) > 0 else -1
+        return np.arange(len(points)) == first_best
     return np.asarray(moocore.is_nondominated(points, maximise=True, keep_weakly=False), dtype=bool)
 
 
 def _utilities(values: ArrayLike, preferences: ArrayLike) -> Array:
     """w . V for each preference and value, (n_preferences, n_solutions)."""
-    points, w = as_points(values), as_points(preferences, "preferences")
+    points, w = as_points(values, at_least=1), as_points(preferences, "preferences", at_least=1)
     if points.shape[1] != w.shape[1]:
         raise ValueError(f"values have {points.shape[1]} objectives, preferences {w.shape[1]}.")
     return w @ points.T

@@ -10,16 +10,15 @@ from typing import Any
 import yaml
 
 from sb3_momba.momba import MOMBA
-from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+from sb3_momba.policies import MombaPolicy
 
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
 RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize")
-POLICIES = {"SimbaPolicy": SimbaPolicy, "MlpPolicy": MlpPolicy}
+POLICIES = MOMBA.policy_aliases
 NOT_FOR_CONFIGURATIONS = {"self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model"}
-INJECTED = set(inspect.signature(MOMBA.__init__).parameters) | {"n_objectives"}
 NOT_FOR_POLICY_KWARGS = {
     *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
-    *INJECTED,
+    *("n_objectives", "critic_loss", "vector_values", "best_return_scale", "gamma"),
 }
 
 
