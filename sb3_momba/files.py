@@ -139,6 +139,14 @@ def with_suffix(path: FilePath, suffix: str) -> FilePath:
     return path if path.suffix else path.with_name(path.name + suffix)
 
 
+def with_existing_suffix(path: FilePath, suffix: str) -> FilePath:
+    """The path itself if there is such a file, else with the suffix appended."""
+    if isinstance(path, io.IOBase) or Path(path).is_file():  # type: ignore[arg-type]
+        return path
+    suffixed = Path(f"{os.fspath(path)}{suffix}")  # type: ignore[arg-type]
+    return suffixed if suffixed.is_file() else path
+
+
 class _Encoder:
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}

@@ -8,7 +8,6 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import fields
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,7 +23,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
 from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler
 from sb3_momba.envs.wrappers import n_objectives_of
-from sb3_momba.files import FileFormatError, FilePath, read_tree, register, with_suffix, write_tree
+from sb3_momba.files import FileFormatError, FilePath, read_tree, register, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.policies import MombaPolicy
 
 FORMAT_VERSION = 1
@@ -251,14 +250,6 @@ def pickled_by_sb3(path: FilePath) -> bool:
     with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
         names = archive.namelist()
     return "_stable_baselines3_version" in names and "tree.json" not in names
-
-
-def with_existing_suffix(path: FilePath, suffix: str) -> FilePath:
-    """The path itself if there is such a file, else with the suffix appended."""
-    if isinstance(path, io.IOBase) or Path(path).is_file():  # type: ignore[arg-type]
-        return path
-    suffixed = Path(f"{os.fspath(path)}{suffix}")  # type: ignore[arg-type]
-    return suffixed if suffixed.is_file() else path
 
 
 def _check_env_fits(env: Any, data: dict[str, Any]) -> None:

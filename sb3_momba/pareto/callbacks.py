@@ -76,7 +76,7 @@ class ParetoEvalCallback(EventCallback):
         self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
         self.go_on = True
         self.is_evaluated = False  # whether the model of this moment is
-        if self.eval_env is self.training_env:
+        if shares_environment(self.eval_env, self.training_env):
             raise ValueError("eval_env is the training environment, whose episodes an evaluation would end: give it its own.")
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.parent = self
@@ -148,3 +148,10 @@ class ParetoEvalCallback(EventCallback):
         arrays["values"] = np.stack(self.values)  # (evaluations, P, n_objectives)
         with atomic_write(self.log_path / "pareto_evaluations.npz") as file:
             np.savez(file, allow_pickle=False, **arrays)
+
+
+def shares_environment(env: Any, venv: VecEnv) -> bool:
+    """Whether stepping `env` would step one of the environments of `venv` in this process."""
+    if isinstance(env, VecEnv):
+        return env.unwrapped is venv.unwrapped
+    return isinstance(env, gym.Env) and any(one.unwrapped is env.unwrapped for one in getattr(venv.unwrapped, "envs", []))

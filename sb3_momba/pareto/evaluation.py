@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
-from sb3_momba.files import FileFormatError, FilePath, read_tree, with_suffix, write_tree
+from sb3_momba.files import FileFormatError, FilePath, read_tree, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.pareto import metrics
 
 MAX_PARALLEL_EPISODES = 128
@@ -76,7 +76,7 @@ class ParetoFront:
     @classmethod
     def load(cls, path: FilePath) -> "ParetoFront":
         """:raises FileFormatError: if the file is damaged or no front"""
-        tree, _ = read_tree(path)
+        tree, _ = read_tree(with_existing_suffix(path, ".npz"))
         if not isinstance(tree, dict) or tree.pop("format", None) != FRONT_FORMAT:
             raise FileFormatError(f"{path} holds no Pareto front.")
         names = {field.name for field in fields(cls)}
@@ -115,6 +115,8 @@ def evaluate_front(
     gamma = float(getattr(model, "gamma", 0.99)) if gamma is None else gamma
     probe = _probe(env, env_kwargs)
     grid = preference_grid(probe.n_objectives, n_preferences) if preferences is None else np.atleast_2d(preferences)
+    if len(grid) == 0:
+        raise ValueError("preferences has no rows: give at least one preference.")
     grid = check_preference(grid, probe.n_objectives).astype(np.float64)
     n_run = 1 if probe.deterministic and deterministic else n_episodes
     jobs = [(w, seed + episode) for w in grid for episode in range(n_run)]
@@ -188,6 +190,8 @@ class _Probe:
 def _probe(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict[str, Any] | None) -> _Probe:
     """What must be known of an environment before it is copied."""
     if isinstance(env, VecEnv):
+        if env_kwargs:
+            raise ValueError("env_kwargs go with an id or a callable; this VecEnv exists already.")
         check_vec_env(env)
         if is_vecenv_wrapped(env, VecNormalize):
             raise ValueError("VecNormalize scales rewards, which are no returns then: give the environment without it.")
