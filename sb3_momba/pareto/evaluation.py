@@ -119,7 +119,7 @@ def evaluate_front(
         raise ValueError("preferences has no rows: give at least one preference.")
     grid = check_preference(grid, probe.n_objectives).astype(np.float64)
     n_run = 1 if probe.deterministic and deterministic else n_episodes
-    jobs = [(w, seed + episode) for w in grid for episode in range(n_run)]
+    jobs = [(w, int(seed) + episode) for w in grid for episode in range(n_run)]
 
     venv, is_ours = _make_vec_env(env, min(len(jobs), MAX_PARALLEL_EPISODES), env_kwargs)
     try:
