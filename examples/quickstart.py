@@ -5,7 +5,7 @@ import mo_gymnasium
 from sb3_momba import MOMBA, evaluate_front, plot_front
 
 model = MOMBA("SimbaPolicy", "mo-hopper-2obj-v5", ent_coef="auto_0.01", seed=0, verbose=1)
-model.learn(20_000, progress_bar=True)
+model.learn(10_000, progress_bar=True)  # a few minutes on two cores; a million steps for a finished policy
 
 front = evaluate_front(model, "mo-hopper-2obj-v5", n_preferences=20, n_episodes=1)
 print(f"hypervolume {front.hypervolume():,.0f}, preference regret {front.preference_regret():.1f}")

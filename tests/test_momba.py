@@ -100,7 +100,7 @@ def test_without_a_seed_two_runs_differ():
 # ------------------------------------------------------------------------------------- every size and every variant
 
 
-@pytest.mark.parametrize("n_objectives", [1, 2, 3, 6])
+@pytest.mark.parametrize("n_objectives", [1, 2, 3, 6, 10])
 @pytest.mark.parametrize("vector_values", [False, True], ids=["scalar", "vector"])
 def test_any_number_of_objectives_and_environments_trains_saves_and_predicts_alike(n_objectives, vector_values):
     make = partial(make_mo_vec_env, StubEnv, 4, env_kwargs={"n_objectives": n_objectives})
