@@ -32,11 +32,11 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         if not isinstance(env, VecEnv):
             env = wrap_env(make_env(env, render_mode="rgb_array"))
         venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        check_vec_env(venv)
         if is_vecenv_wrapped(venv, VecNormalize):
             raise ValueError("VecNormalize changes what the replay buffer stores: leave it out. The policy normalises itself.")
         if n_objectives_of(venv) > 1 and is_vecenv_wrapped(venv, VecFrameStack):
             raise ValueError("VecFrameStack stacks preferences too: leave it out, and stack frames inside PreferenceWrapper.")
+        check_vec_env(venv)
         return venv
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -21,6 +21,7 @@ from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 
 MAX_SKIPPED_UPDATES = 20
+RANGES = {"gamma": (0, 1), "tau": (0, 1), "batch_size": (1, np.inf), "buffer_size": (1, np.inf)}
 CHOICES = {
     "critic_loss": ("ce", "mse"),
     "critic_minimum": ("scalarised", "objective"),
@@ -197,6 +198,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
             raise ValueError("her and preference_alignment need two objectives or more: with one there is no preference.")
         if self.her_kwargs is not None and not self.her:
             raise ValueError(f"her_kwargs={self.her_kwargs} without her=True: set her=True, or leave them out.")
+        for name, (low, high) in RANGES.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name}={getattr(self, name)}: it must lie in [{low}, {high}].")
         doubled = sorted(set(self.policy_kwargs) & set(self._injected_policy_kwargs()))
         if doubled:
             raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")

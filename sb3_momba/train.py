@@ -24,7 +24,13 @@ from sb3_momba.momba import MOMBA
 from sb3_momba.pareto.callbacks import ParetoEvalCallback
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.saving import library_versions
-from sb3_momba.zoo.configuration import Configuration, check_hyperparameters, read_configuration, shipped_configurations
+from sb3_momba.zoo.configuration import (
+    Configuration,
+    check_hyperparameters,
+    literal,
+    read_configuration,
+    shipped_configurations,
+)
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
 
@@ -71,26 +77,32 @@ def run(settings: RunSettings) -> RunResult:
     folder = Path(settings.output)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
+    if settings.steps < 1:
+        raise ValueError(f"steps={settings.steps}: train for at least one step.")
+    evaluation = ParetoEvalCallback(
+        settings.env,
+        eval_freq=settings.eval_freq,
+        n_preferences=settings.n_preferences,
+        n_episodes=settings.n_episodes,
+        reference_point=settings.reference_point,
+        objectives=settings.objectives,
+        log_path=folder,
+        best_model_save_path=folder,
+    )
     vec_env_cls = SubprocVecEnv if settings.subprocesses else DummyVecEnv
     env = make_mo_vec_env(settings.env, settings.n_envs, vec_env_cls=vec_env_cls)
     try:
         model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
+        evaluation.check(model)
+        # Nothing is written before this line, so that a run that is refused can be repeated.
         config = {**asdict(settings), "command": " ".join(sys.argv), "versions": library_versions()}
         with atomic_write(folder / "config.json") as file:
             file.write(json.dumps(config, indent=2).encode())
         model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-        evaluation = ParetoEvalCallback(
-            settings.env,
-            eval_freq=settings.eval_freq,
-            n_preferences=settings.n_preferences,
-            n_episodes=settings.n_episodes,
-            reference_point=settings.reference_point,
-            objectives=settings.objectives,
-            log_path=folder,
-            best_model_save_path=folder,
-        )
-        model.learn(settings.steps, callback=evaluation, progress_bar=settings.progress_bar)
-        model.save(folder / "model.zip")
+        try:
+            model.learn(settings.steps, callback=evaluation, progress_bar=settings.progress_bar)
+        finally:
+            model.save(folder / "model.zip")
     finally:
         env.close()
     assert evaluation.front is not None
@@ -116,9 +128,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     )
     parser.add_argument("--env", required=True, help="environment id")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--steps", type=lambda text: int(float(text)), help="environment steps; by default the configuration's, or 1e6"
-    )
+    parser.add_argument("--steps", type=whole_number, help="environment steps; by default the configuration's, or 1e6")
     parser.add_argument(
         "--conf", help=f"yaml file in rl_zoo3's format, or one of the shipped: {', '.join(shipped_configurations())}"
     )
@@ -146,7 +156,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     machine.add_argument("--no-progress-bar", action="store_true")
 
     evaluation = parser.add_argument_group("evaluation")
-    evaluation.add_argument("--eval-freq", type=lambda text: int(float(text)), default=50_000, help="environment steps")
+    evaluation.add_argument("--eval-freq", type=whole_number, default=50_000, help="environment steps")
     evaluation.add_argument("--n-preferences", type=int, default=100)
     evaluation.add_argument("--n-episodes", type=int, default=5, help="per preference")
     evaluation.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume; 0 by default")
@@ -184,6 +194,11 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     )
 
 
+def whole_number(text: str) -> int:
+    """An integer that may be written 1e6."""
+    return int(float(text))
+
+
 def first_given(*values: int | None) -> int:
     """The first value that is not None."""
     return next(value for value in values if value is not None)
@@ -197,7 +212,7 @@ def assign(hyperparameters: dict[str, Any], assignment: str) -> None:
     *parents, key = name.split(".")
     for parent in parents:
         hyperparameters = hyperparameters.setdefault(parent, {})
-    hyperparameters[key] = yaml.safe_load(text)
+    hyperparameters[key] = literal(yaml.safe_load(text))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -205,6 +220,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result = run(parse(arguments))
     except (ValueError, MemoryError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("\nInterrupted: the run's folder holds the model as it was.", file=sys.stderr)
+        sys.exit(130)
     print(report(result))
 
 

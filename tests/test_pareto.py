@@ -748,7 +748,7 @@ def test_what_cannot_be_evaluated_is_an_error_that_says_why(kwargs, message):
 
 
 def test_a_model_of_other_objectives_is_an_error():
-    with pytest.raises(ValueError, match="shape"):
+    with pytest.raises(ValueError, match="The model has 3 objectives, the environment SeededEnv has 2"):
         evaluate_front(tiny_model(SeededEnv(3)), SeededEnv, 2, 1)
 
 

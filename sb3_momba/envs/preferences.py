@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 PreferenceSampler = Callable[[np.random.Generator], np.ndarray]
-SamplerSpec = str | dict[str, Any]
+SamplerSpec = str | dict[str, Any] | Sequence[float]
 
 SIMPLEX_TOLERANCE = 1e-5
 
@@ -105,13 +105,16 @@ class ConeSampler:
 def make_sampler(spec: PreferenceSampler | SamplerSpec, n_objectives: int) -> PreferenceSampler:
     """A sampler from a literal, as configuration files write it; a callable is returned as it is.
 
-    :param spec: "uniform", "cone", or a dictionary: `name`, for "cone" `angle` in degrees, for "fixed" `preference`, and
-        `per_step` for a new preference after every step
+    :param spec: "uniform"; "cone"; weights to keep; or a dictionary with `name`, for "cone" the `angle` in degrees, for
+        "fixed" the `preference`, and `per_step` for a new preference after every step
     :raises ValueError: for anything else
     """
     if callable(spec):
         return spec
-    options: dict[str, Any] = {"name": spec} if isinstance(spec, str) else dict(spec)
+    if isinstance(spec, str):
+        options: dict[str, Any] = {"name": spec}
+    else:
+        options = dict(spec) if isinstance(spec, dict) else {"name": "fixed", "preference": spec}
     name, per_step = options.pop("name", None), options.pop("per_step", False)
     try:
         if n_objectives == 1:

@@ -8,10 +8,11 @@ import gymnasium as gym
 import mo_gymnasium  # noqa: F401  registers its environments' ids
 import numpy as np
 from gymnasium import spaces
+from mo_gymnasium.wrappers.wrappers import LinearReward
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_momba.envs.preferences import PreferenceSampler, UniformSampler, check_preference, preference_dim
+from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 
 LARGEST_REWARD = 1e10
 
@@ -38,11 +39,12 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     reward must be a scalar. It stands inside `Monitor`, which needs a scalar: `Monitor(PreferenceWrapper(env))`.
 
     :param env: observations must be a one-dimensional Box, actions a bounded Box
-    :param preference_sampler: `rng -> (n_objectives,)`; uniform on the simplex by default
+    :param preference_sampler: `rng -> (n_objectives,)`, or a literal as `make_sampler` takes it; uniform on the simplex by
+        default
     :raises ValueError: naming what the environment has and what to do about it
     """
 
-    def __init__(self, env: gym.Env, preference_sampler: PreferenceSampler | None = None):
+    def __init__(self, env: gym.Env, preference_sampler: PreferenceSampler | SamplerSpec | None = None):
         gym.utils.RecordConstructorArgs.__init__(self, preference_sampler=preference_sampler)
         super().__init__(env)
         check_spaces(env.observation_space, env.action_space)
@@ -55,7 +57,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             )
         self.preference_dim = preference_dim(self.n_objectives)
         self.env_index = 0
-        self.preference_sampler: PreferenceSampler = preference_sampler or UniformSampler(self.n_objectives)
+        self.set_preference_sampler(preference_sampler)
         self._fixed_preference: np.ndarray | None = None
         self._preference: np.ndarray | None = None
         self._holds_for_episode = False
@@ -81,13 +83,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._fixed_preference = None if preference is None else self._one_preference(preference)
         self._holds_for_episode = self._holds_for_episode and preference is None
 
-    def set_preference_sampler(self, sampler: PreferenceSampler | CloudpickleWrapper | None) -> None:
+    def set_preference_sampler(self, sampler: PreferenceSampler | SamplerSpec | CloudpickleWrapper | None) -> None:
         """Draw preferences with `sampler` from the next draw on; None: uniform on the simplex.
 
         :param sampler: or SB3's wrapper around it, which takes any callable into subprocesses
         """
         own = sampler.var if isinstance(sampler, CloudpickleWrapper) else sampler
-        self.preference_sampler = own or UniformSampler(self.n_objectives)
+        self.preference_sampler: PreferenceSampler = make_sampler("uniform" if own is None else own, self.n_objectives)
 
     def set_env_index(self, index: int) -> None:
         """The environment's place in its VecEnv, for error messages."""
@@ -191,6 +193,8 @@ HOW_TO_DECLARE = (
 
 def declared_reward_space(env: gym.Env) -> spaces.Box | None:
     """The environment's `reward_space`, wherever in its stack of wrappers it stands, or None."""
+    if LinearReward in wrapper_layers(env):
+        return None  # MO-Gymnasium's own scalarisation, behind which the reward space still shows
     space = env.get_wrapper_attr("reward_space") if env.has_wrapper_attr("reward_space") else None
     if space is not None and (not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1):
         raise ValueError(f"reward_space={space!r} is not a one-dimensional Box with an entry per objective.")
@@ -251,7 +255,7 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
     return env(**(env_kwargs or {}))
 
 
-def wrap_env(env: gym.Env, preference_sampler: PreferenceSampler | None = None) -> Monitor:
+def wrap_env(env: gym.Env, preference_sampler: PreferenceSampler | SamplerSpec | None = None) -> Monitor:
     """`Monitor(PreferenceWrapper(env))`, unless both are there already."""
     layers = list(wrapper_layers(env))
     has_monitor, has_preference = Monitor in layers, PreferenceWrapper in layers
@@ -275,7 +279,7 @@ def make_mo_vec_env(
     env: str | Callable[[], gym.Env],
     n_envs: int = 1,
     seed: int | None = None,
-    preference_sampler: PreferenceSampler | None = None,
+    preference_sampler: PreferenceSampler | SamplerSpec | None = None,
     env_kwargs: dict[str, Any] | None = None,
     vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
     vec_env_kwargs: dict[str, Any] | None = None,
@@ -290,6 +294,9 @@ def make_mo_vec_env(
     """
     if isinstance(env, gym.Env):
         raise ValueError("make_mo_vec_env needs an id or a callable that makes new environments, not one environment.")
+
+    if n_envs < 1:
+        raise ValueError(f"n_envs={n_envs}: at least one environment is needed.")
 
     def maker(index: int) -> Callable[[], gym.Env]:
         def make() -> gym.Env:

@@ -1,5 +1,6 @@
 """Evaluating the Pareto front while the model trains."""
 
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,13 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.files import atomic_write
-from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
+from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_front, probe_environment
+from sb3_momba.pareto.metrics import hypervolume
 from sb3_momba.pareto.plotting import plot_front
+
+logger = logging.getLogger(__name__)
 
 
 class ParetoEvalCallback(EventCallback):
@@ -21,8 +26,8 @@ class ParetoEvalCallback(EventCallback):
     that belong to those steps.
 
     Records `pareto/hypervolume`, `pareto/expected_utility`, `pareto/preference_regret` and `pareto/n_non_dominated`, and
-    the front's picture where the logger takes figures. `last_mean_reward` and `best_mean_reward` are hypervolumes, so
-    that callbacks made for SB3's EvalCallback work.
+    the front's picture where the logger takes figures. `last_mean_reward` and `best_mean_reward` are hypervolumes (mean
+    returns where there is one objective), so that callbacks made for SB3's EvalCallback work.
 
     :param eval_env: id, callable, environment or VecEnv; see `evaluate_front`
     :param eval_freq: environment steps, over all training environments
@@ -71,6 +76,8 @@ class ParetoEvalCallback(EventCallback):
         self.values: list[np.ndarray] = []
         self.last_mean_reward = -np.inf
         self.best_mean_reward = -np.inf
+        self.best_score = (-np.inf, -np.inf)  # hypervolume, then expected utility
+        self.warned_of_reference_point = False
 
     def _init_callback(self) -> None:
         self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
@@ -78,9 +85,22 @@ class ParetoEvalCallback(EventCallback):
         self.is_evaluated = False  # whether the model of this moment is
         if shares_environment(self.eval_env, self.training_env):
             raise ValueError("eval_env is the training environment, whose episodes an evaluation would end: give it its own.")
+        self.check(self.model)
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.parent = self
             self.callback_on_new_best.init_callback(self.model)
+
+    def check(self, model: Any) -> None:
+        """Find out before a long training what an evaluation would stumble over.
+
+        :raises ValueError: for an environment, a reference point or names that do not fit the model
+        """
+        n_objectives = check_model_fits(model, probe_environment(self.eval_env))
+        preference_grid(n_objectives, self.evaluation_kwargs["n_preferences"])
+        if self.reference_point is not None:
+            hypervolume(np.zeros((1, n_objectives)), self.reference_point)
+        if self.objectives is not None and len(self.objectives) != n_objectives:
+            raise ValueError(f"objectives={self.objectives}: {n_objectives} names are needed, one per objective.")
 
     def _on_rollout_start(self) -> None:
         # Only here have the last transition and the updates that follow it been made.
@@ -110,7 +130,16 @@ class ParetoEvalCallback(EventCallback):
         self.timesteps.append(self.num_timesteps)
         self.metrics.append(measured)
         self.values.append(front.values)
-        self.last_mean_reward = measured["hypervolume"]
+        # With one objective the hypervolume above 0 says nothing that the mean return does not.
+        self.last_mean_reward = measured["hypervolume" if front.n_objectives > 1 else "expected_utility"]
+        score = (self.last_mean_reward, measured["expected_utility"])
+        if front.n_objectives > 1 and measured["hypervolume"] == 0 and not self.warned_of_reference_point:
+            self.warned_of_reference_point = True
+            logger.warning(
+                "No value lies above the reference point %s: the hypervolume is 0, and the best model that of the largest "
+                "expected utility. Give reference_point= a point that is worse than what the policies reach.",
+                np.zeros(front.n_objectives).tolist() if self.reference_point is None else self.reference_point,
+            )
         if self.verbose >= 1:
             print(f"Front at {self.num_timesteps:,} steps:", ", ".join(f"{k} {v:,.6g}" for k, v in measured.items()))
         if self.log_path is not None:
@@ -118,8 +147,8 @@ class ParetoEvalCallback(EventCallback):
         self._log(front, measured)
 
         continue_training = True
-        if self.last_mean_reward > self.best_mean_reward:
-            self.best_mean_reward = self.last_mean_reward
+        if score > self.best_score:
+            self.best_score, self.best_mean_reward = score, self.last_mean_reward
             if self.best_model_save_path is not None:
                 self.model.save(self.best_model_save_path / "best_model.zip")
             if self.callback_on_new_best is not None:

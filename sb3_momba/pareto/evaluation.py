@@ -113,7 +113,8 @@ def evaluate_front(
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes}: at least one episode is needed.")
     gamma = float(getattr(model, "gamma", 0.99)) if gamma is None else gamma
-    probe = _probe(env, env_kwargs)
+    probe = probe_environment(env, env_kwargs)
+    check_model_fits(model, probe)
     grid = preference_grid(probe.n_objectives, n_preferences) if preferences is None else np.atleast_2d(preferences)
     if len(grid) == 0:
         raise ValueError("preferences has no rows: give at least one preference.")
@@ -181,13 +182,15 @@ def _run_jobs(
 
 
 @dataclass
-class _Probe:
+class Probe:
+    """What is known of an environment before it is evaluated."""
+
     name: str
     n_objectives: int
     deterministic: bool
 
 
-def _probe(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict[str, Any] | None) -> _Probe:
+def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict[str, Any] | None = None) -> Probe:
     """What must be known of an environment before it is copied."""
     if isinstance(env, VecEnv):
         if env_kwargs:
@@ -197,15 +200,26 @@ def _probe(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict
             raise ValueError("VecNormalize scales rewards, which are no returns then: give the environment without it.")
         spec = env.get_attr("spec", indices=[0])[0]
         deterministic = env.has_attr("deterministic") and all(env.get_attr("deterministic"))
-        return _Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic))
+        return Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic))
     one = wrap_env(make_env(env, env_kwargs))
     try:
         name = one.spec.id if one.spec is not None else type(one.unwrapped).__name__
         deterministic = one.has_wrapper_attr("deterministic") and one.get_wrapper_attr("deterministic")
-        return _Probe(name, one.get_wrapper_attr("n_objectives"), bool(deterministic))
+        return Probe(name, one.get_wrapper_attr("n_objectives"), bool(deterministic))
     finally:
         if one.unwrapped is not getattr(env, "unwrapped", None):
             one.close()
+
+
+def check_model_fits(model: Any, probe: Probe) -> int:
+    """The number of objectives.
+
+    :raises ValueError: if a model that knows its own has another one
+    """
+    n_objectives = getattr(model, "n_objectives", probe.n_objectives)
+    if n_objectives != probe.n_objectives:
+        raise ValueError(f"The model has {n_objectives} objectives, the environment {probe.name} has {probe.n_objectives}.")
+    return probe.n_objectives
 
 
 def _make_vec_env(

@@ -58,7 +58,7 @@ def read_configuration(name: str, env_id: str) -> Configuration:
     entry = entries.get(env_id, entries.get("default")) if isinstance(entries, dict) else None
     if not isinstance(entry, dict):
         raise ValueError(f"{name} has no entry {env_id!r} and no 'default'.")
-    entry = dict(entry)
+    entry = literal(entry)
     if entry.pop("normalize", False):
         raise ValueError(f"{name}: normalize must be false: the policy normalises observations and rewards itself.")
     policy = entry.pop("policy", "SimbaPolicy")
@@ -67,6 +67,21 @@ def read_configuration(name: str, env_id: str) -> Configuration:
         entry["train_freq"] = tuple(entry["train_freq"])
     check_hyperparameters(policy, entry)
     return Configuration(policy, entry, None if n_timesteps is None else int(n_timesteps), n_envs)
+
+
+def literal(value: Any) -> Any:
+    """A yaml value in which numbers such as 1e-3, strings to yaml 1.1, are numbers."""
+    if isinstance(value, dict):
+        return {key: literal(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [literal(item) for item in value]
+    if isinstance(value, str):
+        try:
+            number = float(value)
+        except ValueError:
+            return value
+        return int(number) if number.is_integer() else number
+    return value
 
 
 def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
