@@ -4,12 +4,14 @@ import csv
 import itertools
 import json
 
+import mo_gymnasium
 import numpy as np
 import pytest
 import torch as th
 import yaml
+from mo_gymnasium.wrappers.wrappers import LinearReward
 
-from sb3_momba import MOMBA, ParetoFront, PreferenceWrapper
+from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, PreferenceWrapper
 from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler, make_sampler
 from sb3_momba.nn.layers import Film, HyperDense
 from sb3_momba.nn.networks import CONDITIONINGS
@@ -390,3 +392,63 @@ def test_preference_alignment_warns_once_of_negative_returns(sign: int, warns: b
     kwargs = {"buffer_size": 50, "learning_starts": 50, "policy_kwargs": TINY_SIMBA}
     MOMBA("SimbaPolicy", StubEnv(rewards=rewards), vector_values=True, preference_alignment=True, **kwargs).learn(30)
     assert sum("not negative" in str(warning.message) for warning in recwarn) == int(warns)
+
+
+def test_numbers_that_yaml_reads_as_strings_are_numbers(tmp_path) -> None:
+    settings = parse(["--env", "E", "--set", "learning_rate=1e-3", "--set", "buffer_size=1e4", "--set", "ent_coef=auto_0.1"])
+    assert settings.hyperparameters == {"learning_rate": 0.001, "buffer_size": 10_000, "ent_coef": "auto_0.1"}
+    assert isinstance(settings.hyperparameters["buffer_size"], int)
+    path = tmp_path / "mine.yml"
+    path.write_text("default:\n  learning_rate: 3e-4\n  policy_kwargs:\n    support: [-1e1, 1e1]\n")
+    hyperparameters = read_configuration(str(path), "E").hyperparameters
+    assert hyperparameters == {"learning_rate": 3e-4, "policy_kwargs": {"support": [-10, 10]}}
+
+
+@pytest.mark.parametrize(
+    ("option", "match"),
+    [
+        ("--reference-point 0", r"reference point \[0.0\] has shape \(1,\)"),
+        ("--objectives a", "2 names are needed"),
+        ("--n-preferences 0", "must be at least 1"),
+        ("--eval-freq 0", "eval_freq=0"),
+        ("--steps 0", "steps=0"),
+        ("--n-envs 0", "n_envs=0"),
+        ("--set gamma=2", "gamma=2"),
+        ("--set batch_size=0", "batch_size=0"),
+    ],
+)
+def test_a_refused_run_writes_nothing(tmp_path, option: str, match: str) -> None:
+    with pytest.raises(SystemExit, match=match):
+        main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path / "run"), *option.split()])
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupted_run_leaves_its_model(tmp_path, monkeypatch) -> None:
+    def interrupted(model, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(MOMBA, "learn", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path / "run"), "--set", "buffer_size=100"])
+    assert stop.value.code == 130
+    MOMBA.load(tmp_path / "run" / "model.zip")
+
+
+def test_mo_gymnasiums_linear_reward_is_one_objective() -> None:
+    env = LinearReward(mo_gymnasium.make("mo-hopper-2obj-v5"), weight=np.array([0.25, 0.75]))
+    model = MOMBA("SimbaPolicy", env, buffer_size=50, learning_starts=10, policy_kwargs=TINY_SIMBA).learn(20)
+    assert model.n_objectives == 1
+    assert model.observation_space.shape == (11,)
+
+
+def test_wrappers_take_samplers_as_literals_and_weights() -> None:
+    assert PreferenceWrapper(StubEnv(), "uniform").preference_sampler == UniformSampler(2)
+    assert PreferenceWrapper(StubEnv(), [0.25, 0.75]).preference_sampler == FixedSampler((0.25, 0.75))
+
+
+def test_values_below_the_reference_point_are_said_and_the_best_model_is_that_of_the_largest_utility(caplog) -> None:
+    callback = ParetoEvalCallback(StubEnv, eval_freq=10, n_preferences=3, n_episodes=1)
+    MOMBA("SimbaPolicy", StubEnv(), buffer_size=50, learning_starts=50, policy_kwargs=TINY_SIMBA).learn(20, callback=callback)
+    assert callback.best_score[0] == 0  # the second objective of the stub is negative
+    assert np.isfinite(callback.best_score[1])
+    assert caplog.text.count("No value lies above the reference point [0.0, 0.0]") == 1
