@@ -138,7 +138,7 @@ def train_and_score(task_name: str, steps: int, seed: int, policy: str, critic_l
         task.make(),
         learning_rate=1e-3,
         learning_starts=500,
-        batch_size=128,
+        batch_size=256,
         gamma=GAMMA,
         critic_loss=critic_loss,
         vector_values=vector_values,
