@@ -459,6 +459,19 @@ def test_a_vector_reward_inside_monitor_is_an_error_that_names_the_order():
         tiny_model(Monitor(StubEnv()))
 
 
+def test_subclasses_of_the_wrappers_count_as_the_wrappers():
+    class OwnWrapper(PreferenceWrapper):
+        pass
+
+    class OwnMonitor(Monitor):
+        pass
+
+    model = tiny_model(OwnMonitor(OwnWrapper(StubEnv())))
+    assert model.observation_space.shape == (5,)  # one preference, not two
+    with pytest.raises(ValueError, match=r"Monitor\(PreferenceWrapper\(env\)\)"):
+        PreferenceWrapper(OwnMonitor(StubEnv()))
+
+
 def test_an_environment_that_is_wrapped_already_is_not_wrapped_twice():
     env = Monitor(PreferenceWrapper(StubEnv(), FixedSampler((0.25, 0.75))))
     model = tiny_model(env)

@@ -9,6 +9,7 @@ import mo_gymnasium  # noqa: F401  registers its environments' ids
 import numpy as np
 from gymnasium import spaces
 from mo_gymnasium.wrappers.wrappers import LinearReward
+from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -50,7 +51,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         check_spaces(env.observation_space, env.action_space)
         self.n_objectives = count_objectives(env)
         self.declares_objectives = declared_reward_space(env) is not None
-        if self.declares_objectives and Monitor in wrapper_layers(env):
+        if self.declares_objectives and is_wrapped(env, Monitor):
             raise ValueError(
                 "This environment has a vector reward inside Monitor, which needs a scalar: build it as "
                 "Monitor(PreferenceWrapper(env)) or with make_mo_vec_env."
@@ -193,7 +194,7 @@ HOW_TO_DECLARE = (
 
 def declared_reward_space(env: gym.Env) -> spaces.Box | None:
     """The environment's `reward_space`, wherever in its stack of wrappers it stands, or None."""
-    if LinearReward in wrapper_layers(env):
+    if is_wrapped(env, LinearReward):
         return None  # MO-Gymnasium's own scalarisation, behind which the reward space still shows
     space = env.get_wrapper_attr("reward_space") if env.has_wrapper_attr("reward_space") else None
     if space is not None and (not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1):
@@ -257,22 +258,12 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
 
 def wrap_env(env: gym.Env, preference_sampler: PreferenceSampler | SamplerSpec | None = None) -> Monitor:
     """`Monitor(PreferenceWrapper(env))`, unless both are there already."""
-    layers = list(wrapper_layers(env))
-    has_monitor, has_preference = Monitor in layers, PreferenceWrapper in layers
+    has_monitor, has_preference = is_wrapped(env, Monitor), is_wrapped(env, PreferenceWrapper)
     if has_preference and preference_sampler is not None:
         env.get_wrapper_attr("set_preference_sampler")(preference_sampler)
     if not has_preference:
         env = PreferenceWrapper(env, preference_sampler)
     return env if has_monitor else Monitor(env)  # type: ignore[return-value]
-
-
-def wrapper_layers(env: gym.Env) -> list[type]:
-    """The classes of an environment's wrappers, outermost first."""
-    layers = []
-    while isinstance(env, gym.Wrapper):
-        layers.append(type(env))
-        env = env.env
-    return layers
 
 
 def make_mo_vec_env(
