@@ -120,7 +120,7 @@ def read_tree(path: FilePath) -> tuple[Any, list[str]]:
     name = getattr(path, "name", "the file object") if isinstance(path, io.IOBase) else os.fspath(path)  # type: ignore[arg-type]
     try:
         with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
-            content = json.loads(archive.read("tree.json"), parse_constant=_refuse_constant)
+            content = json.loads(archive.read("tree.json"), parse_constant=refuse_constant)
             left_out = [str(place) for place in content["left_out"]]
             return _Decoder(archive).decode(content["tree"]), left_out
     except (FileNotFoundError, IsADirectoryError, PermissionError):
@@ -277,5 +277,5 @@ def _write_archive(file: BinaryIO, text: str, arrays: dict[str, np.ndarray]) -> 
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
 
 
-def _refuse_constant(name: str) -> None:
+def refuse_constant(name: str) -> None:
     raise FileFormatError(f"its JSON holds {name}, which strict JSON does not have.")

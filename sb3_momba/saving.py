@@ -3,15 +3,12 @@
 import inspect
 import io
 import os
-import platform
 import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any, TypeVar
 
-import numpy as np
-import stable_baselines3 as sb3
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise
@@ -25,6 +22,7 @@ from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.files import FileFormatError, FilePath, read_tree, register, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.policies import MombaPolicy
+from sb3_momba.system import library_versions
 
 FORMAT_VERSION = 1
 MODEL_FORMAT = "sb3_momba.model"
@@ -200,18 +198,6 @@ class PickleFreeSaving(OffPolicyAlgorithm):
 
 # What an argument of a model that is a class may be.
 CLASSES_AT = {"policy_class": MombaPolicy, "replay_buffer_class": PreferenceReplayBuffer}
-
-
-def library_versions() -> dict[str, str]:
-    from sb3_momba import __version__
-
-    return {
-        "sb3_momba": __version__,
-        "stable_baselines3": sb3.__version__,
-        "torch": th.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
 
 
 def read_format(path: FilePath, expected: str) -> dict[str, Any]:

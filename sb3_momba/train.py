@@ -1,35 +1,42 @@
 """Train from the command line: `python -m sb3_momba.train --env mo-hopper-2obj-v5 --steps 1e6`.
 
-The variants of the thesis carry the names of its Table A.1. Each run has a folder of its own: the configuration, the
-models, the evaluations, the front's picture, and logs as CSV and for TensorBoard.
+The variants of the thesis carry the names of its Table A.1. Each run has a folder of its own: the record (settings, curve and
+final front; `sb3_momba/records.py` says its format), the models, the evaluations, the front's picture, and logs as CSV and for
+TensorBoard.
 """
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import yaml
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_momba.envs.wrappers import make_mo_vec_env
-from sb3_momba.files import atomic_write
+from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
+from sb3_momba.files import qualified_name
 from sb3_momba.momba import MOMBA
-from sb3_momba.pareto.callbacks import ParetoEvalCallback
+from sb3_momba.pareto import protocol
+from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
 from sb3_momba.pareto.evaluation import ParetoFront
-from sb3_momba.saving import library_versions
+from sb3_momba.pareto.floors import evaluate_floors
+from sb3_momba.records import FILE_NAME as RECORD_NAME
+from sb3_momba.records import RecordWriter
 from sb3_momba.zoo.configuration import (
     Configuration,
     check_hyperparameters,
     literal,
     read_configuration,
     shipped_configurations,
+    with_defaults,
 )
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
@@ -39,22 +46,27 @@ ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
 class RunSettings:
     """One training run.
 
+    :param label: the method's name in its record and in reports
     :param hyperparameters: MOMBA's arguments
+    :param env_kwargs: of the environment, such as {"physics": "current"}
     :param output: the run's folder; must not hold a run already
     :param eval_freq: environment steps between evaluations
+    :param reference_point: of the hypervolume; None: the task's in `pareto/protocol.py`
     """
 
     env: str
     output: str
     steps: int = 1_000_000
     seed: int = 0
+    label: str = "momba"
     policy: str = "SimbaPolicy"
     hyperparameters: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
     n_envs: int = 1
     subprocesses: bool = False
     eval_freq: int = 50_000
-    n_preferences: int = 100
-    n_episodes: int = 5
+    n_preferences: int = protocol.N_PREFERENCES
+    n_episodes: int = protocol.N_EPISODES
     reference_point: list[float] | None = None
     objectives: list[str] | None = None
     device: str = "auto"
@@ -63,11 +75,12 @@ class RunSettings:
 
 @dataclass
 class RunResult:
-    """What a run left: its front, its hypervolumes over time and its folder."""
+    """What a run left: its front, its metrics over time, those of policies that learned nothing, and its folder."""
 
     front: ParetoFront
     timesteps: list[int]
     metrics: list[dict[str, float]]
+    floors: dict[str, dict[str, float]]
     folder: Path
 
 
@@ -79,43 +92,83 @@ def run(settings: RunSettings) -> RunResult:
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
     if settings.steps < 1:
         raise ValueError(f"steps={settings.steps}: train for at least one step.")
-    evaluation = ParetoEvalCallback(
-        settings.env,
-        eval_freq=settings.eval_freq,
-        n_preferences=settings.n_preferences,
-        n_episodes=settings.n_episodes,
-        reference_point=settings.reference_point,
-        objectives=settings.objectives,
-        log_path=folder,
-        best_model_save_path=folder,
-    )
-    vec_env_cls = SubprocVecEnv if settings.subprocesses else DummyVecEnv
-    env = make_mo_vec_env(settings.env, settings.n_envs, vec_env_cls=vec_env_cls)
+    make_one = partial(make_env, settings.env, settings.env_kwargs)
+    env = make_mo_vec_env(make_one, settings.n_envs, vec_env_cls=SubprocVecEnv if settings.subprocesses else DummyVecEnv)
     try:
+        reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives_of(env))
+        record = RecordWriter(folder / RECORD_NAME)
+        evaluation = ParetoEvalCallback(
+            make_one,
+            eval_freq=settings.eval_freq,
+            n_preferences=settings.n_preferences,
+            n_episodes=settings.n_episodes,
+            reference_point=reference_point,
+            objectives=settings.objectives,
+            log_path=folder,
+            best_model_save_path=folder,
+            callback_after_eval=RecordCallback(record),
+        )
         model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
         evaluation.check(model)
+        preferences = preference_grid(model.n_objectives, settings.n_preferences)
         # Nothing is written before this line, so that a run that is refused can be repeated.
-        config = {**asdict(settings), "command": " ".join(sys.argv), "versions": library_versions()}
-        with atomic_write(folder / "config.json") as file:
-            file.write(json.dumps(config, indent=2).encode())
-        model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-        try:
-            model.learn(settings.steps, callback=evaluation, progress_bar=settings.progress_bar)
-        finally:
-            model.save(folder / "model.zip")
+        with record.start(**description(settings, model, preferences, reference_point)):
+            floors = {}
+            for name, front in evaluate_floors(make_one, preferences, settings.n_episodes).items():
+                floors[name] = front.metrics(reference_point)
+                record.append("floor", policy=name, **floors[name], values=front.values)
+            model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
+            try:
+                model.learn(settings.steps, callback=evaluation, progress_bar=settings.progress_bar)
+            finally:
+                model.save(folder / "model.zip")
+            assert evaluation.front is not None
+            record.finish(model.num_timesteps, vars(evaluation.front))
     finally:
         env.close()
-    assert evaluation.front is not None
-    return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, folder)
+    return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, floors, folder)
+
+
+def description(
+    settings: RunSettings, model: MOMBA, preferences: np.ndarray, reference_point: Sequence[float]
+) -> dict[str, Any]:
+    """The first line of a run's record."""
+    config = {name: value for name, value in asdict(settings).items() if name not in ("output", "progress_bar")}
+    config["hyperparameters"] = with_defaults(settings.policy, settings.hyperparameters)
+    return {
+        "label": settings.label,
+        "env": settings.env,
+        "env_kwargs": settings.env_kwargs,
+        "seed": settings.seed,
+        "config": plain(config),
+        "reference_point": reference_point,
+        "preferences": preferences,
+        "parameters": {
+            "actor": sum(p.numel() for p in model.actor.parameters()),
+            "critic": sum(p.numel() for p in model.critic.parameters()),
+        },
+    }
+
+
+def plain(x: Any) -> Any:
+    """A setting as JSON can hold it: classes and functions by their names."""
+    if isinstance(x, dict):
+        return {str(key): plain(value) for key, value in x.items()}
+    if isinstance(x, list | tuple | np.ndarray):
+        return [plain(value) for value in x]
+    if x is None or isinstance(x, bool | int | float | str):
+        return x
+    return qualified_name(x if hasattr(x, "__qualname__") else type(x))
 
 
 def report(result: RunResult) -> str:
-    """A run's hypervolume over time and where its picture is, as text."""
+    """A run's metrics over time beside those of policies that learned nothing, and where its picture is, as text."""
     columns = ("steps", "hypervolume", "expected utility", "preference regret")
     lines = ["  ".join(f"{column:>17}" for column in columns)]
-    for step, m in zip(result.timesteps, result.metrics, strict=True):
+    curve = [(f"{step:,}", m) for step, m in zip(result.timesteps, result.metrics, strict=True)]
+    for name, m in [*result.floors.items(), *curve]:
         lines.append(
-            f"{step:>17,}  {m['hypervolume']:>17,.6g}  {m['expected_utility']:>17,.5g}  {m['preference_regret']:>17,.4g}"
+            f"{name:>17}  {m['hypervolume']:>17,.6g}  {m['expected_utility']:>17,.5g}  {m['preference_regret']:>17,.4g}"
         )
     picture = result.folder / "front.png"
     lines.append(f"Run folder: {result.folder}" + (f"   Picture of the front: {picture}" if picture.exists() else ""))
@@ -132,6 +185,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     parser.add_argument(
         "--conf", help=f"yaml file in rl_zoo3's format, or one of the shipped: {', '.join(shipped_configurations())}"
     )
+    parser.add_argument("--label", help="the method's name in reports; by default the configuration's")
     parser.add_argument("--output", help="folder of the run; by default runs/ENV/TIME-SEED")
 
     variant = parser.add_argument_group("variants (Table A.1)")
@@ -150,6 +204,9 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     )
 
     machine = parser.add_argument_group("running")
+    machine.add_argument(
+        "--env-kwargs", action="append", default=[], metavar="NAME=VALUE", help="of the environment, such as physics=current"
+    )
     machine.add_argument("--n-envs", type=int, help="environments side by side")
     machine.add_argument("--subprocesses", action="store_true", help="each in a process of its own")
     machine.add_argument("--device", default="auto")
@@ -157,9 +214,11 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
 
     evaluation = parser.add_argument_group("evaluation")
     evaluation.add_argument("--eval-freq", type=whole_number, default=50_000, help="environment steps")
-    evaluation.add_argument("--n-preferences", type=int, default=100)
-    evaluation.add_argument("--n-episodes", type=int, default=5, help="per preference")
-    evaluation.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume; 0 by default")
+    evaluation.add_argument("--n-preferences", type=int, default=protocol.N_PREFERENCES)
+    evaluation.add_argument("--n-episodes", type=int, default=protocol.N_EPISODES, help="per preference")
+    evaluation.add_argument(
+        "--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0"
+    )
     evaluation.add_argument("--objectives", nargs="+", help="names for the picture's axes")
 
     given = parser.parse_args(arguments)
@@ -173,15 +232,19 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         "ent_coef": given.ent_coef,
     }
     hyperparameters.update({name: value for name, value in options.items() if value is not None})
-    for assignment in given.set:
-        assign(hyperparameters, assignment)
+    env_kwargs: dict[str, Any] = {}
+    for assignments, option, values in ((given.set, "--set", hyperparameters), (given.env_kwargs, "--env-kwargs", env_kwargs)):
+        for assignment in assignments:
+            assign(values, assignment, option)
     return RunSettings(
         env=given.env,
         output=given.output or f"runs/{given.env}/{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
         steps=first_given(given.steps, configuration.n_timesteps, 1_000_000),
         seed=given.seed,
         policy=ARCHITECTURES[given.architecture] if given.architecture else configuration.policy,
+        label=given.label or (Path(given.conf).stem if given.conf else "momba"),
         hyperparameters=hyperparameters,
+        env_kwargs=env_kwargs,
         n_envs=first_given(given.n_envs, configuration.n_envs),
         subprocesses=given.subprocesses,
         eval_freq=given.eval_freq,
@@ -204,15 +267,15 @@ def first_given(*values: int | None) -> int:
     return next(value for value in values if value is not None)
 
 
-def assign(hyperparameters: dict[str, Any], assignment: str) -> None:
+def assign(values: dict[str, Any], assignment: str, option: str = "--set") -> None:
     """Put "name=value" or "name.key=value" into a dictionary; the value is a yaml literal, never evaluated."""
     name, separator, text = assignment.partition("=")
     if not separator or not name:
-        raise ValueError(f"--set {assignment}: write NAME=VALUE.")
+        raise ValueError(f"{option} {assignment}: write NAME=VALUE.")
     *parents, key = name.split(".")
     for parent in parents:
-        hyperparameters = hyperparameters.setdefault(parent, {})
-    hyperparameters[key] = literal(yaml.safe_load(text))
+        values = values.setdefault(parent, {})
+    values[key] = literal(yaml.safe_load(text))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

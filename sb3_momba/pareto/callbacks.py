@@ -2,6 +2,8 @@
 
 import logging
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_front, probe_environment
 from sb3_momba.pareto.metrics import hypervolume
 from sb3_momba.pareto.plotting import plot_front
+from sb3_momba.records import RecordWriter
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +43,7 @@ class ParetoEvalCallback(EventCallback):
 
     def __init__(
         self,
-        eval_env: str | gym.Env | VecEnv,
+        eval_env: str | gym.Env | VecEnv | Callable[[], gym.Env],
         eval_freq: int = 50_000,
         n_preferences: int = 100,
         n_episodes: int = 5,
@@ -74,6 +77,7 @@ class ParetoEvalCallback(EventCallback):
         self.timesteps: list[int] = []
         self.metrics: list[dict[str, float]] = []
         self.values: list[np.ndarray] = []
+        self.evaluation_seconds = 0.0
         self.last_mean_reward = -np.inf
         self.best_mean_reward = -np.inf
         self.best_score = (-np.inf, -np.inf)  # hypervolume, then expected utility
@@ -118,15 +122,11 @@ class ParetoEvalCallback(EventCallback):
 
     def _evaluate(self) -> bool:
         """Measure, log and write the front; False where a callback wants the training to stop."""
+        started = time.perf_counter()
         self.num_timesteps = self.model.num_timesteps
         self.is_evaluated = True
         self.front = front = evaluate_front(self.model, self.eval_env, **self.evaluation_kwargs)  # type: ignore[arg-type]
-        measured = {
-            "hypervolume": front.hypervolume(self.reference_point),
-            "expected_utility": front.expected_utility(),
-            "preference_regret": front.preference_regret(),
-            "n_non_dominated": float(front.non_dominated().sum()),
-        }
+        measured = front.metrics(self.reference_point)
         self.timesteps.append(self.num_timesteps)
         self.metrics.append(measured)
         self.values.append(front.values)
@@ -153,6 +153,7 @@ class ParetoEvalCallback(EventCallback):
                 self.model.save(self.best_model_save_path / "best_model.zip")
             if self.callback_on_new_best is not None:
                 continue_training = self.callback_on_new_best.on_step()
+        self.evaluation_seconds += time.perf_counter() - started
         if self.callback is not None:
             continue_training = self._on_event() and continue_training
         return continue_training
@@ -177,6 +178,31 @@ class ParetoEvalCallback(EventCallback):
         arrays["values"] = np.stack(self.values)  # (evaluations, P, n_objectives)
         with atomic_write(self.log_path / "pareto_evaluations.npz") as file:
             np.savez(file, allow_pickle=False, **arrays)
+
+
+class RecordCallback(BaseCallback):
+    """Appends each evaluation to a run's record: the `callback_after_eval` of a ParetoEvalCallback."""
+
+    parent: ParetoEvalCallback
+
+    def __init__(self, record: RecordWriter):
+        super().__init__()
+        self.record = record
+
+    def _on_training_start(self) -> None:
+        self.started = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        evaluating = self.parent.evaluation_seconds
+        self.record.append(
+            "evaluation",
+            steps=self.parent.num_timesteps,
+            seconds=round(time.perf_counter() - self.started - evaluating, 3),
+            evaluation_seconds=round(evaluating, 3),
+            **self.parent.metrics[-1],
+            values=self.parent.values[-1],
+        )
+        return True
 
 
 def shares_environment(env: Any, venv: VecEnv) -> bool:

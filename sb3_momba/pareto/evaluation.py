@@ -69,6 +69,11 @@ class ParetoFront:
         """What asking for a preference loses against the best policy found for it."""
         return metrics.preference_regret(self.values, self.preferences)
 
+    def metrics(self, reference_point: ArrayLike | None = None) -> dict[str, float]:
+        """All of the above by name; the reference point is 0 by default."""
+        reference = np.zeros(self.n_objectives) if reference_point is None else reference_point
+        return metrics.summarise(self.values, self.preferences, reference)
+
     def save(self, path: FilePath) -> None:
         """Write one file, ".npz" appended if it has no suffix, atomically and without pickle."""
         write_tree(with_suffix(path, ".npz"), {"format": FRONT_FORMAT, **vars(self)})
@@ -188,6 +193,7 @@ class Probe:
     name: str
     n_objectives: int
     deterministic: bool
+    action_space: Any  # a Box; wrap_env refuses others
 
 
 def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict[str, Any] | None = None) -> Probe:
@@ -200,12 +206,12 @@ def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_k
             raise ValueError("VecNormalize scales rewards, which are no returns then: give the environment without it.")
         spec = env.get_attr("spec", indices=[0])[0]
         deterministic = env.has_attr("deterministic") and all(env.get_attr("deterministic"))
-        return Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic))
+        return Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic), env.action_space)
     one = wrap_env(make_env(env, env_kwargs))
     try:
         name = one.spec.id if one.spec is not None else type(one.unwrapped).__name__
         deterministic = one.has_wrapper_attr("deterministic") and one.get_wrapper_attr("deterministic")
-        return Probe(name, one.get_wrapper_attr("n_objectives"), bool(deterministic))
+        return Probe(name, one.get_wrapper_attr("n_objectives"), bool(deterministic), one.action_space)
     finally:
         if one.unwrapped is not getattr(env, "unwrapped", None):
             one.close()

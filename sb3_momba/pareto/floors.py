@@ -1,9 +1,17 @@
 """What has to be beaten: policies that have learned nothing."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front, probe_environment
+
+MEASURED = ("returns", "discounted_returns", "episode_lengths")
 
 
 class ZeroActionPolicy:
@@ -28,3 +36,22 @@ class RandomPolicy:
         """:param observation: (batch, observation_dim)"""
         low, high = self.action_space.low, self.action_space.high
         return self.rng.uniform(low, high, (len(observation), len(low))).astype(np.float32), None
+
+
+def evaluate_floors(
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env], preferences: np.ndarray, n_episodes: int = 5, seed: int = 0
+) -> dict[str, ParetoFront]:
+    """Both, under the protocol of a learned policy.
+
+    Random actions give a set of P noisy points, whose hypervolume is above that of their mean: a floor that favours nobody.
+
+    :param preferences: (P, n_objectives)
+    """
+    action_space = probe_environment(env).action_space
+    random = evaluate_front(
+        RandomPolicy(action_space, seed), env, preferences=preferences, n_episodes=n_episodes, seed=seed, deterministic=False
+    )
+    still = evaluate_front(ZeroActionPolicy(action_space), env, preferences=preferences[:1], n_episodes=n_episodes, seed=seed)
+    # It is the same under every preference.
+    tiled: dict[str, Any] = {name: np.repeat(getattr(still, name), len(preferences), axis=0) for name in MEASURED}
+    return {"standing still": replace(still, preferences=random.preferences, **tiled), "random actions": random}

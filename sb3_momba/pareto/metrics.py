@@ -81,6 +81,28 @@ def non_dominated(values: ArrayLike) -> NDArray[np.bool_]:
     return np.asarray(moocore.is_nondominated(points, maximise=True, keep_weakly=False), dtype=bool)
 
 
+def convex_coverage(values: ArrayLike, preferences: ArrayLike) -> Array:
+    """The values that are the best for some preference: the convex envelope of section 4.4, each point once.
+
+    :return: (n, n_objectives)
+    """
+    points = as_points(values, at_least=1)
+    return np.unique(points[_utilities(points, preferences).argmax(axis=1)], axis=0)
+
+
+def summarise(values: ArrayLike, preferences: ArrayLike, reference_point: ArrayLike) -> dict[str, float]:
+    """The numbers that describe one evaluation, under the names of logs and records.
+
+    :param values: V_w for each preference, in their order, (n_preferences, n_objectives)
+    """
+    return {
+        "hypervolume": hypervolume(values, reference_point),
+        "expected_utility": expected_utility(values, preferences),
+        "preference_regret": preference_regret(values, preferences),
+        "n_non_dominated": float(non_dominated(values).sum()),
+    }
+
+
 def _utilities(values: ArrayLike, preferences: ArrayLike) -> Array:
     """w . V for each preference and value, (n_preferences, n_solutions)."""
     points, w = as_points(values, at_least=1), as_points(preferences, "preferences", at_least=1)

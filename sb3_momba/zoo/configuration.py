@@ -1,6 +1,7 @@
 """Reading hyperparameters from yaml in rl_zoo3's format. Values are literals: nothing is evaluated."""
 
 import inspect
+from collections.abc import Container
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import resources
@@ -101,6 +102,25 @@ def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
     for name in policy_kwargs:
         if name not in policy_known:
             raise ValueError(f"{policy} has no argument {name!r}{nearest(name, policy_known)}")
+
+
+def with_defaults(policy: str, hyperparameters: dict[str, Any]) -> dict[str, Any]:
+    """Every argument of MOMBA and, under `policy_kwargs`, of its policy, as a run uses them."""
+    policy_defaults = {**defaults(MombaPolicy), **defaults(POLICIES[policy])}
+    return {
+        **defaults(MOMBA, NOT_FOR_CONFIGURATIONS),
+        **hyperparameters,
+        "policy_kwargs": {
+            **{name: value for name, value in policy_defaults.items() if name not in NOT_FOR_POLICY_KWARGS},
+            **(hyperparameters.get("policy_kwargs") or {}),
+        },
+    }
+
+
+def defaults(cls: type, but: Container[str] = ()) -> dict[str, Any]:
+    """The arguments of a constructor that have a default, with it."""
+    arguments = inspect.signature(cls.__init__).parameters.values()  # type: ignore[misc]
+    return {a.name: a.default for a in arguments if a.default is not inspect.Parameter.empty and a.name not in but}
 
 
 def parameters(cls: type) -> set[str]:

@@ -1,0 +1,1 @@
+"""Comparing methods: grids of runs, statistics and reports over their records."""

@@ -1,0 +1,23 @@
+"""`python -m sb3_momba.benchmark run` trains a grid of runs, `... report` compares their records."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from sb3_momba.benchmark import grid
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m sb3_momba.benchmark", description=__doc__, allow_abbrev=False)
+    commands = parser.add_subparsers(dest="command", required=True)
+    grid.add_arguments(commands.add_parser("run", help="train a grid of runs", allow_abbrev=False))
+    given, rest = parser.parse_known_args(arguments)
+    try:
+        if given.command == "run":
+            grid.main(given, rest)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

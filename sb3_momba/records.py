@@ -1,0 +1,229 @@
+"""Run records: what a run was and what came of it, in one append-only file that needs nothing but a JSON reader.
+
+A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has an `event`:
+
+- `start`, the first line: `format`, `version`, `label` (the method's name), `env`, `env_kwargs`, `seed`, `config` (every
+  setting of the run, defaults included), `reference_point` (n_objectives,), `preferences` (P, n_objectives), `parameters`
+  (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
+- `floor`, one for each policy that learned nothing: `policy`, `values` (P, n_objectives) and the metrics.
+- `evaluation`, one for each point of the curve: `steps`, `seconds` (of training, without evaluations),
+  `evaluation_seconds` (so far), the metrics and `values` (P, n_objectives), mean undiscounted returns in the order of
+  `preferences`.
+- `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `preferences` (P, n_objectives),
+  `returns` and `discounted_returns` (P, episodes, n_objectives), `episode_lengths` (P, episodes) and its `settings`; one that
+  "failed" has its `error`.
+
+A record without an `end` is of a run that still goes on or was killed. The metrics (`hypervolume`, `expected_utility`,
+`preference_regret`, `n_non_dominated`) are there for the reader's convenience: they follow from the values.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_momba.files import FileFormatError, refuse_constant
+from sb3_momba.system import git_revision, library_versions, machine
+
+FORMAT = "sb3_momba.record"
+VERSION = 1
+FILE_NAME = "record.jsonl"
+UNENDED = "no end: killed, or still running"
+
+Array = NDArray[np.float64]
+
+
+class RecordWriter:
+    """Appends to a new record, each line on disk before the call returns.
+
+    `with writer.start(...):` writes the first line, and the failure if what is inside raises.
+
+    :param path: of the record, which must not exist
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = Path(path)
+        self.is_ended = False
+
+    def start(self, **content: Any) -> "RecordWriter":
+        """:param content: of the first line, beside versions, machine, revision and time"""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.touch(exist_ok=False)
+        provenance = {"versions": library_versions(), "machine": machine(), "git_revision": git_revision()}
+        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        self.append("start", format=FORMAT, version=VERSION, **content, **provenance, started=now)
+        return self
+
+    def append(self, event: str, **content: Any) -> None:
+        """:raises ValueError: for numbers that are not finite, before anything is written"""
+        line = json.dumps({"event": event, **content}, allow_nan=False, default=_as_list)
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(line + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def finish(self, steps: int, front: dict[str, Any]) -> None:
+        """:param front: the attributes of a ParetoFront"""
+        self.append("end", status="finished", steps=steps, front=front)
+        self.is_ended = True
+
+    def __enter__(self) -> "RecordWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        if error is not None and not self.is_ended:
+            self.is_ended = True
+            self.append("end", status="failed", error=f"{type(error).__name__}: {error}")
+
+
+def _as_list(x: Any) -> Any:
+    if isinstance(x, np.ndarray | np.generic):
+        return x.tolist()
+    raise TypeError(f"A record cannot hold a {type(x).__name__}: {x!r}.")
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What a policy earns that learned nothing: its mean returns, (P, n_objectives)."""
+
+    policy: str
+    values: Array
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One point of the curve; `seconds` of training, `values` (P, n_objectives)."""
+
+    steps: int
+    seconds: float
+    values: Array
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record as it was read. `error` is None for a run that finished; one without an end counts as failed."""
+
+    path: Path
+    label: str
+    env: str
+    env_kwargs: dict[str, Any]
+    seed: int
+    config: dict[str, Any]
+    reference_point: Array
+    preferences: Array
+    start: dict[str, Any]
+    floors: list[Floor]
+    evaluations: list[Evaluation]
+    final_values: Array | None
+    error: str | None
+
+    @property
+    def task(self) -> str:
+        """The environment, with the arguments that it was made with."""
+        arguments = ", ".join(f"{name}={value}" for name, value in self.env_kwargs.items())
+        return f"{self.env} ({arguments})" if arguments else self.env
+
+
+def find_records(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """The records among files and, recursively, in folders: *.jsonl, in the order of their names.
+
+    :raises FileNotFoundError: for a path that does not exist, or if there is none at all
+    """
+    found: list[Path] = []
+    for path in map(Path, paths):
+        if not path.exists():
+            raise FileNotFoundError(f"{path} does not exist: give record files, or folders that hold some.")
+        found += sorted(path.rglob("*.jsonl")) if path.is_dir() else [path]
+    if not found:
+        raise FileNotFoundError(f"No record (*.jsonl) lies in {', '.join(str(path) for path in paths)}.")
+    return list(dict.fromkeys(path.resolve() for path in found))
+
+
+def read_record(path: str | os.PathLike[str]) -> Record:
+    """
+    :raises FileFormatError: for a damaged file, or one of another format or version, naming it
+    """
+    path = Path(path)
+    try:
+        events = list(_events(path))
+        return _to_record(path, events)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise FileFormatError(f"{path} is damaged, or no record: {type(error).__name__}: {error}.") from error
+
+
+def _events(path: Path) -> Iterator[dict[str, Any]]:
+    lines = path.read_bytes().split(b"\n")
+    # What follows the last line break was cut off while it was written.
+    for number, line in enumerate(lines[:-1], start=1):
+        try:
+            event = json.loads(line, parse_constant=refuse_constant)
+        except ValueError as error:
+            raise FileFormatError(f"line {number} is no JSON: {error}.") from error
+        if not isinstance(event, dict) or not isinstance(event.get("event"), str):
+            raise FileFormatError(f"line {number} has no event.")
+        yield event
+
+
+def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
+    start = events[0] if events else {}
+    if start.get("event") != "start" or start.get("format") != FORMAT:
+        raise FileFormatError(f"it is no record: its first line must be a start of format {FORMAT!r}.")
+    if start.get("version") != VERSION:
+        raise FileFormatError(
+            f"it is a record of version {start.get('version')!r}, this sb3_momba reads version {VERSION}: it was written by "
+            f"sb3_momba {start.get('versions', {}).get('sb3_momba')}."
+        )
+    reference_point = _numbers(start["reference_point"], "reference_point", (None,))
+    preferences = _numbers(start["preferences"], "preferences", (None, len(reference_point)))
+    shape = preferences.shape
+    floors, evaluations = [], []
+    final_values: Array | None = None
+    error: str | None = UNENDED
+    for event in events[1:]:
+        if event["event"] == "floor":
+            floors.append(Floor(str(event["policy"]), _numbers(event["values"], "a floor's values", shape)))
+        elif event["event"] == "evaluation":
+            values = _numbers(event["values"], "an evaluation's values", shape)
+            evaluations.append(Evaluation(int(event["steps"]), float(event["seconds"]), values))
+        elif event["event"] == "end" and event["status"] == "finished":
+            returns = _numbers(event["front"]["returns"], "the front's returns", (shape[0], None, shape[1]))
+            final_values, error = returns.mean(axis=1), None
+        elif event["event"] == "end":
+            final_values, error = None, str(event["error"])
+        else:
+            raise FileFormatError(f"it has an unknown event {event['event']!r}.")
+    return Record(
+        path=path,
+        label=str(start["label"]),
+        env=str(start["env"]),
+        env_kwargs=dict(start["env_kwargs"]),
+        seed=int(start["seed"]),
+        config=dict(start["config"]),
+        reference_point=reference_point,
+        preferences=preferences,
+        start=start,
+        floors=floors,
+        evaluations=evaluations,
+        final_values=final_values,
+        error=error,
+    )
+
+
+def _numbers(x: Any, name: str, shape: tuple[int | None, ...]) -> Array:
+    """A float64 array of this shape; None stands for any length above 0."""
+    array = np.asarray(x, dtype=np.float64)
+    fits = array.ndim == len(shape) and all(n in (None, m) and m > 0 for n, m in zip(shape, array.shape, strict=True))
+    if not fits:
+        raise FileFormatError(f"{name} has shape {array.shape}, not {shape}.")
+    if not np.isfinite(array).all():
+        raise FileFormatError(f"{name} holds a number that is not finite.")
+    return array
