@@ -27,6 +27,7 @@ setup(
         "mo-gymnasium>=1.3",
         "moocore>=0.3",
         "numpy>=1.26",
+        "scipy>=1.11",
         "matplotlib>=3.8",
         "tensorboard>=2.15",
         "tqdm>=4.66",

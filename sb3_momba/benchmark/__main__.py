@@ -4,17 +4,22 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from sb3_momba.benchmark import grid
+from sb3_momba.benchmark import grid, report
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m sb3_momba.benchmark", description=__doc__, allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True)
     grid.add_arguments(commands.add_parser("run", help="train a grid of runs", allow_abbrev=False))
+    report.add_arguments(commands.add_parser("report", help="compare records", allow_abbrev=False))
     given, rest = parser.parse_known_args(arguments)
     try:
         if given.command == "run":
             grid.main(given, rest)
+        elif rest:
+            parser.error(f"unrecognized arguments: {' '.join(rest)}")
+        else:
+            report.main(given)
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
 

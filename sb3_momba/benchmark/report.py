@@ -1,0 +1,179 @@
+"""`python -m sb3_momba.benchmark report RECORDS`: a table, the curves and the fronts of whatever was recorded."""
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
+from sb3_momba.benchmark.statistics import Estimate, estimate, interquartile_mean, probability_of_improvement
+from sb3_momba.files import atomic_write
+from sb3_momba.pareto.plotting import COLOURS, plot_front
+from sb3_momba.records import Record, find_records, read_record
+
+CURVE_REPETITIONS = 2_000
+COLUMNS = {
+    "hypervolume": "hypervolume",
+    "expected utility": "expected_utility",
+    "preference regret": "preference_regret",
+    "IGD": "inverted_generational_distance",
+}
+EXPLANATION = """\
+IQM of the runs with its 95 % interval (stratified bootstrap; a rough one where there are few seeds). Runs: those that
+finished, of all. A run that failed or did not end counts with the hypervolume 0 and the expected utility of the worse
+floor; regret and IGD are of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all solutions in
+this report (section 4.4), so it changes with the records. The curve's mean is the area under it divided by its length.
+"""
+
+
+def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path) -> str:
+    """Write report.md and its pictures into a folder; the report's text."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = ["# Report\n", EXPLANATION]
+    for task in tasks:
+        parts.append(f"## {task.name}\n")
+        parts.append(f"Reference point {task.reference_point.tolist()}.\n")
+        parts.append(task_table(task))
+        name = re.sub(r"[^\w.-]+", "_", task.name).strip("_")
+        if draw_curves(task, folder / f"curve-{name}.png"):
+            parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
+        if draw_fronts(task, folder / f"front-{name}.png"):
+            parts.append(f"![Fronts of the seeds of median hypervolume](front-{name}.png)\n")
+    parts += [comparison_table(tasks), failures(tasks), provenance(records)]
+    text = "\n".join(part for part in parts if part)
+    with atomic_write(folder / "report.md") as file:
+        file.write(text.encode())
+    return text
+
+
+def task_table(task: Task) -> str:
+    rows = [["method", "runs", "steps", "parameters", *COLUMNS, "mean hypervolume of the curve"]]
+    for name, (volume, utility) in task.floors.items():
+        rows.append([f"({name})", "", "", "", f"{volume:,.5g}", f"{utility:,.5g}", "", "", ""])
+    for name, runs in task.methods.items():
+        finished = sum(run.is_finished for run in runs)
+        steps = max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
+        parameters = sum(runs[0].record.start.get("parameters", {}).values())
+        scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()] + [areas_under_curve(runs)]
+        known = [[score for score in column if np.isfinite(score)] for column in scores]
+        estimates = [as_text(estimate(interquartile_mean, [column])) if column else "" for column in known]
+        rows.append([name, f"{finished}/{len(runs)}", f"{steps:,}", f"{parameters:,}", *estimates])
+    return markdown(rows)
+
+
+def comparison_table(tasks: Sequence[Task]) -> str:
+    """P(row > column) in hypervolume, over the tasks that both were run on."""
+    names = sorted({name for task in tasks for name in task.methods})
+    if len(names) < 2:
+        return ""
+    rows = [["", *names]]
+    for row in names:
+        cells = []
+        for column in names:
+            shared = [task.methods for task in tasks if row in task.methods and column in task.methods]
+            if row == column or not shared:
+                cells.append("")
+                continue
+            x, y = ([[run.hypervolume for run in methods[name]] for methods in shared] for name in (row, column))
+            cells.append(f"{as_text(estimate(probability_of_improvement, x, y))} ({len(shared)} tasks)")
+        rows.append([row, *cells])
+    return "## Probability of improvement\n\nOf the row's method over the column's, in hypervolume.\n\n" + markdown(rows)
+
+
+def failures(tasks: Sequence[Task]) -> str:
+    lines = [
+        f"- {task.name}, {name}, seed {run.record.seed}: {run.record.error}"
+        for task in tasks
+        for name, runs in task.methods.items()
+        for run in runs
+        if not run.is_finished
+    ]
+    return "## Runs that did not finish\n\n" + "\n".join(lines) + "\n" if lines else ""
+
+
+def provenance(records: Sequence[Record]) -> str:
+    """What the numbers were made with."""
+    lines = ["## Made with\n"]
+    for title, entry in (("Versions", "versions"), ("Machine", "machine"), ("Git revision", "git_revision")):
+        for made in dict.fromkeys(describe(record.start.get(entry)) for record in records):
+            lines.append(f"- {title}: {made}")
+    return "\n".join(lines) + "\n"
+
+
+def describe(entry: object) -> str:
+    if isinstance(entry, dict):
+        return ", ".join(f"{key} {value}" for key, value in entry.items())
+    return str(entry)
+
+
+def draw_curves(task: Task, path: Path) -> bool:
+    """The IQM of the hypervolume over steps with its interval; False where nothing was evaluated twice."""
+    figure = Figure(figsize=(6, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    drawn = False
+    for i, (name, runs) in enumerate(task.methods.items()):
+        steps, curves = curve_on(runs)
+        if len(steps) < 2:
+            continue
+        points = [estimate(interquartile_mean, [curve], repetitions=CURVE_REPETITIONS) for curve in curves.T]
+        colour = COLOURS[i % len(COLOURS)]
+        axes.plot(steps, [point.value for point in points], color=colour, label=name)
+        axes.fill_between(steps, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.2, linewidth=0)
+        drawn = True
+    if not drawn:
+        return False
+    for (name, (volume, _)), style in zip(task.floors.items(), (":", "--"), strict=False):
+        axes.axhline(volume, color="grey", linestyle=style, linewidth=1, label=name)
+    axes.set(xlabel="environment steps", ylabel="hypervolume (IQM, 95 %)", title=task.name, ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    with atomic_write(path) as file:
+        figure.savefig(file, dpi=150, format="png")
+    return True
+
+
+def draw_fronts(task: Task, path: Path) -> bool:
+    """Each method's front of the seed of median hypervolume; False where there is none of 2 or 3 objectives."""
+    medians = {name: median_run(runs) for name, runs in task.methods.items()}
+    fronts = {
+        f"{name}, seed {run.record.seed}": run.record.final_values
+        for name, run in medians.items()
+        if run is not None and run.record.final_values is not None
+    }
+    if not fronts or len(task.reference_point) not in (2, 3):
+        return False
+    objectives = next((run.record.config.get("objectives") for run in medians.values() if run is not None), None)
+    plot_front(fronts, path, objectives, task.name)
+    return True
+
+
+def median_run(runs: Sequence[Run]) -> Run | None:
+    """The finished run of median hypervolume; of an even number the lower one of the two in the middle."""
+    finished = sorted((run for run in runs if run.is_finished), key=lambda run: run.hypervolume)
+    return finished[(len(finished) - 1) // 2] if finished else None
+
+
+def as_text(estimate: Estimate) -> str:
+    return f"{estimate.value:,.4g} [{estimate.low:,.4g}, {estimate.high:,.4g}]"
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    header, *body = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([header, "|" + "---|" * len(rows[0]), *body]) + "\n"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("records", nargs="+", type=Path, help="record files, or folders that hold some")
+    parser.add_argument("--output", type=Path, help="folder of report.md and its pictures; by default the first of RECORDS")
+    parser.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume, instead of the records' own")
+
+
+def main(given: argparse.Namespace) -> None:
+    records = [read_record(path) for path in find_records(given.records)]
+    first = given.records[0]
+    folder = given.output or (first if first.is_dir() else first.parent)
+    print(write_report(compare(records, given.reference_point), records, folder))
+    print(f"Written to {folder / 'report.md'}.")
