@@ -1,10 +1,13 @@
-"""`python -m sb3_momba.benchmark run` trains a grid of runs, `... report` compares their records."""
+"""`python -m sb3_momba.benchmark run` trains a grid of runs, `report` compares their records, `floors` measures policies that
+learned nothing."""
 
 import argparse
 import sys
 from collections.abc import Sequence
 
-from sb3_momba.benchmark import grid, report
+import gymnasium as gym
+
+from sb3_momba.benchmark import floors, grid, report
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -12,15 +15,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     grid.add_arguments(commands.add_parser("run", help="train a grid of runs", allow_abbrev=False))
     report.add_arguments(commands.add_parser("report", help="compare records", allow_abbrev=False))
+    floors.add_arguments(commands.add_parser("floors", help="measure policies that learned nothing", allow_abbrev=False))
     given, rest = parser.parse_known_args(arguments)
     try:
         if given.command == "run":
             grid.main(given, rest)
         elif rest:
             parser.error(f"unrecognized arguments: {' '.join(rest)}")
-        else:
+        elif given.command == "report":
             report.main(given)
-    except (ValueError, FileNotFoundError) as error:
+        else:
+            floors.main(given)
+    except (ValueError, OSError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
 
 

@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import gymnasium as gym
+
 from sb3_momba.records import FILE_NAME, UNENDED, read_record
 from sb3_momba.zoo.configuration import read_configuration
 
@@ -49,7 +51,10 @@ def make_cells(
 
     :param auto_ent_coef: where configurations that learn alpha start it, all alike
     :raises ValueError: for a configuration that does not exist
+    :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
+    for env in envs:
+        gym.spec(env)
     cells = []
     for seed in range(seeds):
         for env in envs:

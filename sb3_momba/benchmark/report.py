@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
-from sb3_momba.benchmark.statistics import Estimate, estimate, interquartile_mean, probability_of_improvement
+from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
+from sb3_momba.benchmark.tables import as_text, markdown
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.plotting import COLOURS, plot_front
 from sb3_momba.records import Record, find_records, read_record
@@ -154,15 +155,6 @@ def median_run(runs: Sequence[Run]) -> Run | None:
     """The finished run of median hypervolume; of an even number the lower one of the two in the middle."""
     finished = sorted((run for run in runs if run.is_finished), key=lambda run: run.hypervolume)
     return finished[(len(finished) - 1) // 2] if finished else None
-
-
-def as_text(estimate: Estimate) -> str:
-    return f"{estimate.value:,.4g} [{estimate.low:,.4g}, {estimate.high:,.4g}]"
-
-
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-    header, *body = ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join([header, "|" + "---|" * len(rows[0]), *body]) + "\n"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,0 +1,16 @@
+"""Tables in Markdown."""
+
+from collections.abc import Sequence
+
+from sb3_momba.benchmark.statistics import Estimate
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """The first row is the header."""
+    header, *body = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([header, "|" + "---|" * len(rows[0]), *body]) + "\n"
+
+
+def as_text(estimate: Estimate) -> str:
+    """value [low, high]."""
+    return f"{estimate.value:,.4g} [{estimate.low:,.4g}, {estimate.high:,.4g}]"
