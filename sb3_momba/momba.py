@@ -18,6 +18,7 @@ from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
+from sb3_momba.nn.products import fast_float32_products
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 
 MAX_SKIPPED_UPDATES = 20
@@ -283,12 +284,13 @@ class MOMBA(PreferenceConditionedAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
-        for _ in range(gradient_steps):
-            try:
-                self._gradient_step(self._sample(batch_size))
-                self._skipped_updates = 0
-            except NonFiniteLossError as error:
-                self._skip_update(error)
+        with fast_float32_products():
+            for _ in range(gradient_steps):
+                try:
+                    self._gradient_step(self._sample(batch_size))
+                    self._skipped_updates = 0
+                except NonFiniteLossError as error:
+                    self._skip_update(error)
 
     def _gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
         """One pass through the inner loop of Algorithm 1."""
