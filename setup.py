@@ -39,6 +39,9 @@ setup(
         "baselines": ["morl-baselines>=1.3"],
         "test": [
             "sb3-momba[baselines]",
+            "pymoo>=0.6",
+            "rliable>=1.2",
+            "pandas<3",  # rliable's bootstrap library fails with newer ones
             "pytest>=8",
             "pytest-xdist>=3.6",
             "hypothesis>=6.100",

@@ -17,7 +17,9 @@ A record without an `end` is of a run that still goes on or was killed. The metr
 `preference_regret`, `n_non_dominated`) are there for the reader's convenience: they follow from the values.
 """
 
+import io
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -29,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_momba.files import FileFormatError, refuse_constant
+from sb3_momba.files import FileFormatError, qualified_name, refuse_constant
 from sb3_momba.system import git_revision, library_versions, machine
 
 FORMAT = "sb3_momba.record"
@@ -54,20 +56,29 @@ class RecordWriter:
 
     def start(self, **content: Any) -> "RecordWriter":
         """:param content: of the first line, beside versions, machine, revision and time"""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.touch(exist_ok=False)
         provenance = {"versions": library_versions(), "machine": machine(), "git_revision": git_revision()}
         now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        self.append("start", format=FORMAT, version=VERSION, **content, **provenance, started=now)
+        line = _line("start", format=FORMAT, version=VERSION, **content, **provenance, started=now)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._write(line, "xb")
         return self
 
     def append(self, event: str, **content: Any) -> None:
         """:raises ValueError: for numbers that are not finite, before anything is written"""
-        line = json.dumps({"event": event, **content}, allow_nan=False, default=_as_list)
-        with open(self.path, "a", encoding="utf-8") as file:
-            file.write(line + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        self._write(_line(event, **content), "ab")
+
+    def _write(self, line: bytes, mode: str) -> None:
+        """The whole line or, if the disk is full, nothing of it."""
+        with open(self.path, mode, buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size
+            try:
+                with io.BufferedWriter(file) as buffer:  # type: ignore[arg-type]
+                    buffer.write(line)
+                    buffer.flush()
+                    os.fsync(file.fileno())
+            except BaseException:
+                os.truncate(self.path, size)
+                raise
 
     def finish(self, steps: int, front: dict[str, Any]) -> None:
         """:param front: the attributes of a ParetoFront"""
@@ -80,13 +91,35 @@ class RecordWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         if error is not None and not self.is_ended:
             self.is_ended = True
-            self.append("end", status="failed", error=f"{type(error).__name__}: {error}")
+            self.append("end", status="failed", error=f"{type(error).__name__}: {error}".removesuffix(": "))
+
+
+def _line(event: str, **content: Any) -> bytes:
+    return (json.dumps({"event": event, **content}, allow_nan=False, default=_as_list) + "\n").encode()
 
 
 def _as_list(x: Any) -> Any:
     if isinstance(x, np.ndarray | np.generic):
         return x.tolist()
     raise TypeError(f"A record cannot hold a {type(x).__name__}: {x!r}.")
+
+
+def plain(x: Any) -> Any:
+    """A setting as strict JSON can hold it: classes and functions by their names, objects as their attributes, numbers
+    that are not finite as text."""
+    if isinstance(x, dict):
+        return {str(key): plain(value) for key, value in x.items()}
+    if isinstance(x, list | tuple):
+        return [plain(value) for value in x]
+    if isinstance(x, np.ndarray | np.generic):
+        return plain(x.tolist())
+    if isinstance(x, float) and not math.isfinite(x):
+        return str(x)
+    if x is None or isinstance(x, bool | int | float | str):
+        return x
+    if hasattr(x, "__qualname__"):
+        return qualified_name(x)
+    return {"class": qualified_name(type(x)), **plain(getattr(x, "__dict__", {}))}
 
 
 @dataclass(frozen=True)
@@ -118,6 +151,7 @@ class Record:
     config: dict[str, Any]
     reference_point: Array
     preferences: Array
+    parameters: dict[str, int]
     start: dict[str, Any]
     floors: list[Floor]
     evaluations: list[Evaluation]
@@ -127,7 +161,7 @@ class Record:
     @property
     def task(self) -> str:
         """The environment, with the arguments that it was made with."""
-        arguments = ", ".join(f"{name}={value}" for name, value in self.env_kwargs.items())
+        arguments = ", ".join(f"{name}={value}" for name, value in sorted(self.env_kwargs.items()))
         return f"{self.env} ({arguments})" if arguments else self.env
 
 
@@ -137,12 +171,13 @@ def find_records(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     :raises FileNotFoundError: for a path that does not exist, or if there is none at all
     """
     found: list[Path] = []
-    for path in map(Path, paths):
+    given = [Path(path) for path in paths]
+    for path in given:
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist: give record files, or folders that hold some.")
-        found += sorted(path.rglob("*.jsonl")) if path.is_dir() else [path]
+        found += sorted(file for file in path.rglob("*.jsonl") if file.is_file()) if path.is_dir() else [path]
     if not found:
-        raise FileNotFoundError(f"No record (*.jsonl) lies in {', '.join(str(path) for path in paths)}.")
+        raise FileNotFoundError(f"No record (*.jsonl) lies in {', '.join(map(str, given))}.")
     return list(dict.fromkeys(path.resolve() for path in found))
 
 
@@ -151,6 +186,8 @@ def read_record(path: str | os.PathLike[str]) -> Record:
     :raises FileFormatError: for a damaged file, or one of another format or version, naming it
     """
     path = Path(path)
+    if path.is_dir():
+        raise FileFormatError(f"{path} is a folder, not a record.")
     try:
         events = list(_events(path))
         return _to_record(path, events)
@@ -161,12 +198,13 @@ def read_record(path: str | os.PathLike[str]) -> Record:
 
 
 def _events(path: Path) -> Iterator[dict[str, Any]]:
-    lines = path.read_bytes().split(b"\n")
-    # What follows the last line break was cut off while it was written.
-    for number, line in enumerate(lines[:-1], start=1):
+    lines = path.read_bytes().removesuffix(b"\n").split(b"\n")
+    for number, line in enumerate(lines, start=1):
         try:
             event = json.loads(line, parse_constant=refuse_constant)
         except ValueError as error:
+            if number == len(lines) and number > 1:
+                return  # The last line was cut off while it was written.
             raise FileFormatError(f"line {number} is no JSON: {error}.") from error
         if not isinstance(event, dict) or not isinstance(event.get("event"), str):
             raise FileFormatError(f"line {number} has no event.")
@@ -177,10 +215,10 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
     start = events[0] if events else {}
     if start.get("event") != "start" or start.get("format") != FORMAT:
         raise FileFormatError(f"it is no record: its first line must be a start of format {FORMAT!r}.")
-    if start.get("version") != VERSION:
+    if type(start.get("version")) is not int or start["version"] != VERSION:
         raise FileFormatError(
-            f"it is a record of version {start.get('version')!r}, this sb3_momba reads version {VERSION}: it was written by "
-            f"sb3_momba {start.get('versions', {}).get('sb3_momba')}."
+            f"it is a record of version {start.get('version')!r}, this sb3_momba reads version {VERSION}: it was written with "
+            f"{start.get('versions')}."
         )
     reference_point = _numbers(start["reference_point"], "reference_point", (None,))
     preferences = _numbers(start["preferences"], "preferences", (None, len(reference_point)))
@@ -193,7 +231,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
             floors.append(Floor(str(event["policy"]), _numbers(event["values"], "a floor's values", shape)))
         elif event["event"] == "evaluation":
             values = _numbers(event["values"], "an evaluation's values", shape)
-            evaluations.append(Evaluation(int(event["steps"]), float(event["seconds"]), values))
+            evaluations.append(Evaluation(_whole(event["steps"], "steps"), _finite(event["seconds"], "seconds"), values))
         elif event["event"] == "end" and event["status"] == "finished":
             returns = _numbers(event["front"]["returns"], "the front's returns", (shape[0], None, shape[1]))
             final_values, error = returns.mean(axis=1), None
@@ -206,16 +244,29 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         label=str(start["label"]),
         env=str(start["env"]),
         env_kwargs=dict(start["env_kwargs"]),
-        seed=int(start["seed"]),
+        seed=_whole(start["seed"], "seed"),
         config=dict(start["config"]),
         reference_point=reference_point,
         preferences=preferences,
+        parameters={str(name): _whole(n, "parameters") for name, n in dict(start["parameters"]).items()},
         start=start,
         floors=floors,
         evaluations=evaluations,
         final_values=final_values,
         error=error,
     )
+
+
+def _finite(x: Any, name: str) -> float:
+    if isinstance(x, bool) or not isinstance(x, int | float) or not math.isfinite(x):
+        raise FileFormatError(f"{name} is {x!r}, no finite number.")
+    return float(x)
+
+
+def _whole(x: Any, name: str) -> int:
+    if not _finite(x, name).is_integer() or abs(x) > 2**53:
+        raise FileFormatError(f"{name} is {x!r}, no whole number that can be.")
+    return int(x)
 
 
 def _numbers(x: Any, name: str, shape: tuple[int | None, ...]) -> Array:

@@ -22,14 +22,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
-from sb3_momba.files import qualified_name
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.floors import evaluate_floors
 from sb3_momba.records import FILE_NAME as RECORD_NAME
-from sb3_momba.records import RecordWriter
+from sb3_momba.records import RecordWriter, plain
 from sb3_momba.zoo.configuration import (
     Configuration,
     check_hyperparameters,
@@ -133,14 +132,12 @@ def description(
     settings: RunSettings, model: MOMBA, preferences: np.ndarray, reference_point: Sequence[float]
 ) -> dict[str, Any]:
     """The first line of a run's record."""
-    config = {name: value for name, value in asdict(settings).items() if name not in ("output", "progress_bar")}
-    config["hyperparameters"] = with_defaults(settings.policy, settings.hyperparameters)
     return {
         "label": settings.label,
         "env": settings.env,
-        "env_kwargs": settings.env_kwargs,
+        "env_kwargs": plain(settings.env_kwargs),
         "seed": settings.seed,
-        "config": plain(config),
+        "config": recorded_settings(settings),
         "reference_point": reference_point,
         "preferences": preferences,
         "parameters": {
@@ -150,15 +147,11 @@ def description(
     }
 
 
-def plain(x: Any) -> Any:
-    """A setting as JSON can hold it: classes and functions by their names."""
-    if isinstance(x, dict):
-        return {str(key): plain(value) for key, value in x.items()}
-    if isinstance(x, list | tuple | np.ndarray):
-        return [plain(value) for value in x]
-    if x is None or isinstance(x, bool | int | float | str):
-        return x
-    return qualified_name(x if hasattr(x, "__qualname__") else type(x))
+def recorded_settings(settings: RunSettings) -> dict[str, Any]:
+    """Every setting that a result depends on, defaults included, as JSON holds it."""
+    config = {name: value for name, value in asdict(settings).items() if name not in ("output", "progress_bar")}
+    config["hyperparameters"] = with_defaults(settings.policy, settings.hyperparameters)
+    return dict(plain(config))
 
 
 def report(result: RunResult) -> str:

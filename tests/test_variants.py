@@ -344,7 +344,7 @@ def test_a_run_leaves_its_folder(tmp_path, capsys) -> None:
     folder = tmp_path / "run"
     files = {path.name for path in folder.iterdir()}
     assert {
-        "config.json",
+        "record.jsonl",
         "model.zip",
         "best_model.zip",
         "front.npz",
@@ -352,7 +352,8 @@ def test_a_run_leaves_its_folder(tmp_path, capsys) -> None:
         "pareto_evaluations.npz",
         "progress.csv",
     } <= files
-    assert json.loads((folder / "config.json").read_text())["hyperparameters"]["learning_starts"] == 50
+    start = json.loads((folder / "record.jsonl").read_text().splitlines()[0])
+    assert start["config"]["hyperparameters"]["learning_starts"] == 50
     with np.load(folder / "pareto_evaluations.npz", allow_pickle=False) as evaluations:
         assert evaluations["timesteps"].tolist() == [60, 120]
         assert evaluations["values"].shape == (2, 3, 2)

@@ -14,9 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import gymnasium as gym
-
 from sb3_momba.records import FILE_NAME, UNENDED, read_record
+from sb3_momba.train import parse, recorded_settings
 from sb3_momba.zoo.configuration import read_configuration
 
 logger = logging.getLogger(__name__)
@@ -49,50 +48,90 @@ def make_cells(
 ) -> list[Cell]:
     """Seeds vary slowest, so that whatever is finished compares all methods.
 
+    :param seeds: how many
     :param auto_ent_coef: where configurations that learn alpha start it, all alike
-    :raises ValueError: for a configuration that does not exist
-    :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
+    :raises ValueError: for a configuration that does not exist, or two of one name
     """
-    for env in envs:
-        gym.spec(env)
-    cells = []
+    if seeds < 1:
+        raise ValueError(f"seeds={seeds}: at least one is needed.")
+    cells: dict[str, Cell] = {}
     for seed in range(seeds):
         for env in envs:
             for conf in confs:
                 learned = str(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto")).startswith("auto")
                 start = ("--ent-coef", f"auto_{auto_ent_coef}") if auto_ent_coef is not None and learned else ()
-                cells.append(Cell(conf, env, seed, (*start, *options)))
-    return cells
+                cell = Cell(conf, env, seed, (*start, *options))
+                if cell.name in cells:
+                    raise ValueError(f"{cells[cell.name].conf} and {conf} have one name, {cell.name}: rename one of them.")
+                cells[cell.name] = cell
+    return list(cells.values())
 
 
 def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2) -> int:
-    """Run what has not ended yet; the number of runs that failed, now or before."""
+    """Run what has not ended yet; the number of runs that failed, now or before.
+
+    :raises ValueError: for options that are not understood, and for a folder that holds something else, before anything runs
+    """
+    waiting = [cell for cell in cells if has_to_run(cell, output / cell.name)]
     with ThreadPoolExecutor(processes) as pool:
-        return sum(pool.map(lambda cell: _run_cell(cell, output), cells))
+        list(pool.map(lambda cell: _run_cell(cell, output / cell.name), waiting))
+    return sum(outcome(output / cell.name) is not None for cell in cells)
 
 
-def _run_cell(cell: Cell, output: Path) -> bool:
-    """Whether the run failed."""
-    folder = output / cell.name
+def has_to_run(cell: Cell, folder: Path) -> bool:
+    """Whether the cell never ran or was cut off.
+
+    :raises ValueError: if its folder holds anything but a run with the cell's settings
+    """
+    settings = recorded_settings(parse(cell.command(folder)[3:]))
     record = folder / FILE_NAME
-    error = read_record(record).error if record.exists() else UNENDED
-    if error == UNENDED:
-        logger.info("%s starts", cell.name)
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with open(folder.with_name(f"{cell.seed}.log"), "wb") as log:
-            # Runs side by side share the cores: one thread each.
-            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            subprocess.run(cell.command(folder), stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
-        error = read_record(record).error if record.exists() else f"it did not start, see {log.name}"
+    if not record.exists():
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ValueError(f"{folder} holds something else than a run: choose another --output.")
+        return True
+    if cut_off_at_its_start(record):
+        return True
+    found = read_record(record)
+    if found.config != settings:
+        differing = sorted(name for name in {*settings, *found.config} if settings.get(name) != found.config.get(name))
+        raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
+    return found.error == UNENDED
+
+
+def _run_cell(cell: Cell, folder: Path) -> None:
+    logger.info("%s starts", cell.name)
+    shutil.rmtree(folder, ignore_errors=True)  # What was cut off; see `has_to_run`.
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with open(log_of(folder), "wb") as log:
+        # Runs side by side share the cores: one thread each.
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        subprocess.run(cell.command(folder), stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
+    error = outcome(folder)
     logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
-    return error is not None
+
+
+def outcome(folder: Path) -> str | None:
+    """Why a run failed; None for one that finished."""
+    record = folder / FILE_NAME
+    if record.exists() and not cut_off_at_its_start(record):
+        return read_record(record).error
+    said = log_of(folder).read_text(errors="replace").strip() if log_of(folder).exists() else ""
+    return f"it did not start: {said.splitlines()[-1] if said else 'no output'}"
+
+
+def cut_off_at_its_start(record: Path) -> bool:
+    """Whether not even the first line of a record was written to its end."""
+    return b"\n" not in record.read_bytes()
+
+
+def log_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.log")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--conf", nargs="+", required=True, help="shipped configurations or yaml files")
     parser.add_argument("--env", nargs="+", required=True, help="environment ids")
-    parser.add_argument("--seeds", type=int, required=True, help="how many: 0, 1, ...")
+    parser.add_argument("--seeds", type=int, required=True, help="how many; they are 0, 1, ...")
     parser.add_argument("--output", type=Path, required=True, help="folder of the run folders")
     parser.add_argument("--processes", type=int, default=2, help="runs side by side, one thread each")
     parser.add_argument(

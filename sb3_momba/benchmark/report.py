@@ -2,6 +2,7 @@
 
 import argparse
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,9 +11,9 @@ from matplotlib.figure import Figure
 
 from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
-from sb3_momba.benchmark.tables import as_text, markdown
+from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
-from sb3_momba.pareto.plotting import COLOURS, plot_front
+from sb3_momba.pareto.plotting import COLOURS, plot_front, verbatim
 from sb3_momba.records import Record, find_records, read_record
 
 CURVE_REPETITIONS = 2_000
@@ -34,11 +35,12 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path)
     """Write report.md and its pictures into a folder; the report's text."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = ["# Report\n", EXPLANATION]
-    for task in tasks:
+    names = file_names([task.name for task in tasks])
+    for task, name in zip(tasks, names, strict=True):
         parts.append(f"## {task.name}\n")
         parts.append(f"Reference point {task.reference_point.tolist()}.\n")
         parts.append(task_table(task))
-        name = re.sub(r"[^\w.-]+", "_", task.name).strip("_")
+        parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
         if draw_curves(task, folder / f"curve-{name}.png"):
             parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
         if draw_fronts(task, folder / f"front-{name}.png"):
@@ -50,6 +52,24 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path)
     return text
 
 
+def file_names(tasks: Sequence[str]) -> list[str]:
+    """Names that any file system takes, each one once."""
+    names: list[str] = []
+    for task in tasks:
+        name = plain = re.sub(r"[^\w.-]+", "_", task).strip("_")[:100]
+        number = 1
+        while name in names:
+            number += 1
+            name = f"{plain}-{number}"
+        names.append(name)
+    return names
+
+
+def repeated_seeds(task: Task) -> list[str]:
+    counts = Counter(f"{name}, seed {run.record.seed}" for name, runs in task.methods.items() for run in runs)
+    return [run for run, count in counts.items() if count > 1]
+
+
 def task_table(task: Task) -> str:
     rows = [["method", "runs", "steps", "parameters", *COLUMNS, "mean hypervolume of the curve"]]
     for name, (volume, utility) in task.floors.items():
@@ -57,7 +77,7 @@ def task_table(task: Task) -> str:
     for name, runs in task.methods.items():
         finished = sum(run.is_finished for run in runs)
         steps = max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
-        parameters = sum(runs[0].record.start.get("parameters", {}).values())
+        parameters = sum(runs[0].record.parameters.values())
         scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()] + [areas_under_curve(runs)]
         known = [[score for score in column if np.isfinite(score)] for column in scores]
         estimates = [as_text(estimate(interquartile_mean, [column])) if column else "" for column in known]
@@ -86,7 +106,7 @@ def comparison_table(tasks: Sequence[Task]) -> str:
 
 def failures(tasks: Sequence[Task]) -> str:
     lines = [
-        f"- {task.name}, {name}, seed {run.record.seed}: {run.record.error}"
+        f"- {task.name}, {name}, seed {run.record.seed}: {one_line(str(run.record.error))}"
         for task in tasks
         for name, runs in task.methods.items()
         for run in runs
@@ -121,14 +141,14 @@ def draw_curves(task: Task, path: Path) -> bool:
             continue
         points = [estimate(interquartile_mean, [curve], repetitions=CURVE_REPETITIONS) for curve in curves.T]
         colour = COLOURS[i % len(COLOURS)]
-        axes.plot(steps, [point.value for point in points], color=colour, label=name)
+        axes.plot(steps, [point.value for point in points], color=colour, label=verbatim(name))
         axes.fill_between(steps, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.2, linewidth=0)
         drawn = True
     if not drawn:
         return False
     for (name, (volume, _)), style in zip(task.floors.items(), (":", "--"), strict=False):
         axes.axhline(volume, color="grey", linestyle=style, linewidth=1, label=name)
-    axes.set(xlabel="environment steps", ylabel="hypervolume (IQM, 95 %)", title=task.name, ylim=(0, None))
+    axes.set(xlabel="environment steps", ylabel="hypervolume (IQM, 95 %)", title=verbatim(task.name), ylim=(0, None))
     axes.grid(alpha=0.3)
     axes.legend()
     with atomic_write(path) as file:
@@ -146,7 +166,8 @@ def draw_fronts(task: Task, path: Path) -> bool:
     }
     if not fronts or len(task.reference_point) not in (2, 3):
         return False
-    objectives = next((run.record.config.get("objectives") for run in medians.values() if run is not None), None)
+    named = [run.record.config.get("objectives") for run in medians.values() if run is not None]
+    objectives = next((names for names in named if names), None)
     plot_front(fronts, path, objectives, task.name)
     return True
 

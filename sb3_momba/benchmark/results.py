@@ -28,8 +28,8 @@ NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference
 class Run:
     """One run's scores.
 
-    A run that failed or did not end counts with the hypervolume 0 and the expected utility of the worse floor; its regret and
-    its distance are unknown.
+    A run that failed or did not end counts with the hypervolume 0 and the expected utility of the worse floor (of the worst
+    finished run where no floor is recorded); its regret and its distance are unknown.
 
     :param curve: hypervolume at each of `steps`
     """
@@ -77,20 +77,24 @@ def compare(records: Iterable[Record], reference_point: ArrayLike | None = None)
 
 
 def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLike | None) -> Task:
-    points = {tuple(record.reference_point) for record in records}
+    points = sorted({tuple(record.reference_point.tolist()) for record in records})
     if reference_point is None and len(points) > 1:
-        raise ValueError(f"The records of {name} have the reference points {sorted(points)}: choose one, --reference-point.")
+        raise ValueError(f"The records of {name} have the reference points {points}: choose one, --reference-point.")
     reference = records[0].reference_point if reference_point is None else np.asarray(reference_point, dtype=np.float64)
-    n_objectives = {record.preferences.shape[1] for record in records}
-    if n_objectives != {len(reference)}:
-        raise ValueError(f"{name} has {n_objectives} objectives, the reference point {reference.tolist()} {len(reference)}.")
+    for record in records:
+        if record.preferences.shape[1] != len(reference):
+            raise ValueError(
+                f"{name} has {record.preferences.shape[1]} objectives in {record.path}, the reference point "
+                f"{reference.tolist()} has {len(reference)} numbers."
+            )
     finals = [(record.final_values, record.preferences) for record in records if record.final_values is not None]
     front = np.zeros((0, len(reference)))
     if finals:
         values, preferences = (np.concatenate(parts) for parts in zip(*finals, strict=True))
         front = convex_coverage(values, np.unique(preferences, axis=0))
     floors = _floors(records, reference)
-    worst_utility = min((utility for _, utility in floors.values()), default=0.0)
+    utilities = [expected_utility(values, preferences) for values, preferences in finals]
+    worst_utility = min([utility for _, utility in floors.values()] or utilities, default=0.0)
     methods: dict[str, list[Run]] = {}
     for method, its_records in name_methods(records).items():
         methods[method] = [_score(record, reference, front, worst_utility) for record in its_records]
@@ -98,14 +102,12 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
 
 
 def _floors(records: Sequence[Record], reference_point: Array) -> dict[str, tuple[float, float]]:
-    """Hypervolume and expected utility, of the first record that has them: they do not depend on the method."""
-    for record in records:
-        if record.floors:
-            return {
-                floor.policy: (hypervolume(floor.values, reference_point), expected_utility(floor.values, record.preferences))
-                for floor in record.floors
-            }
-    return {}
+    """Hypervolume and expected utility, of a record that has all of them: they do not depend on the method."""
+    record = max(records, key=lambda record: len(record.floors))
+    return {
+        floor.policy: (hypervolume(floor.values, reference_point), expected_utility(floor.values, record.preferences))
+        for floor in record.floors
+    }
 
 
 def _score(record: Record, reference_point: Array, front: Array, worst_utility: float) -> Run:
@@ -140,17 +142,24 @@ def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
         names = sorted({name for one in settings for name in one})
         differing = [name for name in names if len({repr(one.get(name)) for one in settings}) > 1]
         for record, one in zip(by_label[label], settings, strict=True):
-            suffix = ", ".join(f"{name.split('.')[-1]}={one.get(name)}" for name in differing)
+            suffix = ", ".join(f"{name.split('.')[-1]}={_as_text(one.get(name))}" for name in differing)
             methods[f"{label} ({suffix})" if suffix else label].append(record)
     return dict(methods)
 
 
 def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"a": {"b": 1}} -> {"a.b": 1}."""
+    """{"a": {"b": 1}} -> {"a.b": 1.0}: 1 and 1.0 are the same setting."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
-        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value})
+        if isinstance(value, dict):
+            flat.update(_flat(value, f"{prefix}{name}."))
+        else:
+            flat[f"{prefix}{name}"] = float(value) if type(value) is int else value
     return flat
+
+
+def _as_text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def curve_on(runs: Sequence[Run]) -> tuple[Array, Array]:

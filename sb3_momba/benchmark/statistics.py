@@ -54,9 +54,11 @@ def estimate(
     """A statistic with its percentile interval from a stratified bootstrap: runs are drawn anew within each task, each
     sample by itself.
 
-    :param samples: each one the scores of a method
-    :raises ValueError: for a task without runs, or a score that is not finite
+    :param samples: each one the scores of a method, a sequence of tasks
+    :raises ValueError: for no task, a task without runs, or a score that is not finite
     """
+    if any(len(sample) == 0 for sample in samples):
+        raise ValueError("There are no scores: give those of at least one task.")
     rng = np.random.default_rng(seed)
     drawn = [[_resample(task, repetitions, rng) for task in sample] for sample in samples]
     low, high = np.quantile(statistic(*drawn), [(1 - confidence) / 2, (1 + confidence) / 2])

@@ -7,8 +7,12 @@ from sb3_momba.benchmark.statistics import Estimate
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
     """The first row is the header."""
-    header, *body = ["| " + " | ".join(row) + " |" for row in rows]
+    header, *body = ["| " + " | ".join(one_line(cell).replace("|", "\\|") for cell in row) + " |" for row in rows]
     return "\n".join([header, "|" + "---|" * len(rows[0]), *body]) + "\n"
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def as_text(estimate: Estimate) -> str:

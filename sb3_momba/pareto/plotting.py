@@ -46,8 +46,9 @@ def plot_front(
     figure = Figure(figsize=(6, 4.5), layout="constrained")
     axes = figure.add_subplot(projection="3d" if n_objectives == 3 else None)
     for i, (name, p) in enumerate(points.items()):
-        _scatter(axes, p, name, COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
-    axes.set(xlabel=labels[0], ylabel=labels[1], title=title or "")
+        _scatter(axes, p, verbatim(name), COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
+    labels = [verbatim(label) for label in labels]
+    axes.set(xlabel=labels[0], ylabel=labels[1], title=verbatim(title or ""))
     if n_objectives == 3:
         axes.set_zlabel(labels[2])  # type: ignore[attr-defined]
     else:
@@ -59,6 +60,11 @@ def plot_front(
         with atomic_write(path) as file:
             figure.savefig(file, dpi=150, format=os.path.splitext(path)[1].lstrip(".") or "png")
     return figure
+
+
+def verbatim(text: str) -> str:
+    """A text in which matplotlib finds no formula."""
+    return text.replace("$", r"\$")
 
 
 def _scatter(axes: Axes, points: np.ndarray, label: str, colour: str, marker: str) -> None:

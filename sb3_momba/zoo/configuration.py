@@ -90,9 +90,7 @@ def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
     if policy not in POLICIES:
         raise ValueError(f"The policy {policy!r} is not known{nearest(policy, POLICIES)}")
     known = parameters(MOMBA) - NOT_FOR_CONFIGURATIONS
-    policy_known = (parameters(POLICIES[policy]) | parameters(MombaPolicy)) - NOT_FOR_POLICY_KWARGS
-    if policy == "MlpPolicy":
-        policy_known -= {"normalize_weights"}
+    policy_known = policy_parameters(policy)
     for name in hyperparameters:
         if name not in known:
             raise ValueError(f"MOMBA has no hyperparameter {name!r}{nearest(name, [*known, *RUN_KEYS])}")
@@ -111,7 +109,7 @@ def with_defaults(policy: str, hyperparameters: dict[str, Any]) -> dict[str, Any
         **defaults(MOMBA, NOT_FOR_CONFIGURATIONS),
         **hyperparameters,
         "policy_kwargs": {
-            **{name: value for name, value in policy_defaults.items() if name not in NOT_FOR_POLICY_KWARGS},
+            **{name: value for name, value in policy_defaults.items() if name in policy_parameters(policy)},
             **(hyperparameters.get("policy_kwargs") or {}),
         },
     }
@@ -121,6 +119,12 @@ def defaults(cls: type, but: Container[str] = ()) -> dict[str, Any]:
     """The arguments of a constructor that have a default, with it."""
     arguments = inspect.signature(cls.__init__).parameters.values()  # type: ignore[misc]
     return {a.name: a.default for a in arguments if a.default is not inspect.Parameter.empty and a.name not in but}
+
+
+def policy_parameters(policy: str) -> set[str]:
+    """What `policy_kwargs` may hold."""
+    known = (parameters(POLICIES[policy]) | parameters(MombaPolicy)) - NOT_FOR_POLICY_KWARGS
+    return known - {"normalize_weights"} if policy == "MlpPolicy" else known
 
 
 def parameters(cls: type) -> set[str]:

@@ -1,0 +1,821 @@
+"""Run records: what a run writes, that nothing written is lost, and that a reader meets no other surprise than an error."""
+
+import getpass
+import inspect
+import json
+import math
+import os
+import platform
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import asdict, fields
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, records, system
+from sb3_momba.envs.preferences import ConeSampler, preference_grid
+from sb3_momba.envs.wrappers import make_mo_vec_env
+from sb3_momba.files import FileFormatError
+from sb3_momba.pareto import callbacks
+from sb3_momba.pareto.callbacks import RecordCallback
+from sb3_momba.pareto.evaluation import evaluate_front
+from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy, evaluate_floors
+from sb3_momba.pareto.metrics import summarise
+from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
+from sb3_momba.records import Record, RecordWriter, find_records, read_record
+from sb3_momba.train import RunSettings, main, plain, run
+from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
+from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
+
+ENV = "mo-hopper-2obj-v5"
+TINY = {"learning_starts": 50, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
+METRICS = ("hypervolume", "expected_utility", "preference_regret", "n_non_dominated")
+PREFERENCES = [[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]]
+
+
+def settings_of(folder: Path, **changed: Any) -> RunSettings:
+    small = {"steps": 120, "eval_freq": 60, "n_preferences": 3, "n_episodes": 2, "device": "cpu", "progress_bar": False}
+    return RunSettings(ENV, str(folder), label="tiny", seed=3, **{"hyperparameters": deepcopy(TINY), **small, **changed})
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    """What a stranger reads who has nothing but a strict JSON reader."""
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is no strict JSON")
+
+    content = path.read_bytes()
+    assert content.endswith(b"\n")
+    return [json.loads(line, parse_constant=refuse) for line in content.decode("utf-8").splitlines()]
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tmp_path_factory) -> SimpleNamespace:
+    """One real run: its settings, its result and the lines of its record."""
+    settings = settings_of(tmp_path_factory.mktemp("runs") / "run")
+    result = run(settings)
+    path = result.folder / "record.jsonl"
+    return SimpleNamespace(settings=settings, result=result, path=path, lines=lines_of(path))
+
+
+def writer_of(path: Path, **changed: Any) -> RecordWriter:
+    content = {
+        "label": "momba",
+        "env": "E",
+        "env_kwargs": {},
+        "seed": 0,
+        "config": {"hyperparameters": {"gamma": 0.99}},
+        "reference_point": [0.0, 0.0],
+        "preferences": PREFERENCES,
+        "parameters": {"actor": 10, "critic": 20},
+    }
+    return RecordWriter(path).start(**{**content, **changed})
+
+
+def front_of(values: Any) -> dict[str, Any]:
+    """The attributes of a front with one episode for each preference."""
+    returns = np.asarray(values, dtype=np.float64)[:, None]
+    lengths = np.full(returns.shape[:2], 10)
+    return {
+        "preferences": PREFERENCES,
+        "returns": returns,
+        "discounted_returns": 0.9 * returns,
+        "episode_lengths": lengths,
+        "settings": {"env": "E", "seed": 0},
+    }
+
+
+@pytest.fixture(autouse=True)
+def no_revision(monkeypatch) -> None:
+    """git is asked for the real run, which comes first, and in its own test."""
+    monkeypatch.setattr(records, "git_revision", lambda: None)
+
+
+@pytest.fixture
+def valid(tmp_path) -> Path:
+    """A finished record of two floors and two evaluations."""
+    path = tmp_path / "valid.jsonl"
+    with writer_of(path) as writer:
+        for name in ("standing still", "random actions"):
+            writer.append("floor", policy=name, values=[[1.0, 1.0]] * 3, hypervolume=1.0)
+        writer.append("evaluation", steps=10, seconds=1.5, evaluation_seconds=0.5, values=[[1.0, 2.0]] * 3, hypervolume=2.0)
+        writer.append("evaluation", steps=20, seconds=3.0, evaluation_seconds=1.0, values=[[2.0, 2.0]] * 3, hypervolume=4.0)
+        writer.finish(20, front_of([[1.0, 3.0], [2.0, 2.0], [3.0, 1.0]]))
+    return path
+
+
+# -------------------------------------------------------------------------------------------------- what a run writes
+
+
+def test_a_record_holds_what_its_format_promises(tiny_run) -> None:
+    assert [line["event"] for line in tiny_run.lines] == ["start", "floor", "floor", "evaluation", "evaluation", "end"]
+    start, *floors_and_curve, end = tiny_run.lines
+    named = "format version label env env_kwargs seed config reference_point preferences parameters versions machine"
+    assert {*named.split(), "git_revision", "started"} <= set(start)
+    assert (start["format"], start["version"]) == ("sb3_momba.record", 1)
+    assert (start["label"], start["env"], start["env_kwargs"], start["seed"]) == ("tiny", ENV, {}, 3)
+    assert start["reference_point"] == [0.0, 0.0]
+    assert start["preferences"] == PREFERENCES
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", start["started"])
+    for line in floors_and_curve:
+        assert set(METRICS) <= set(line)
+        assert np.shape(line["values"]) == (3, 2)
+    assert [line["policy"] for line in floors_and_curve[:2]] == ["standing still", "random actions"]
+    assert [line["steps"] for line in floors_and_curve[2:]] == [60, 120]
+    assert (end["status"], end["steps"]) == ("finished", 120)
+    front = end["front"]
+    assert np.shape(front["preferences"]) == (3, 2)
+    assert np.shape(front["returns"]) == np.shape(front["discounted_returns"]) == (3, 2, 2)
+    assert np.shape(front["episode_lengths"]) == (3, 2)
+    assert front["settings"]["env"] == ENV
+
+
+def test_values_are_those_of_the_runs_other_files(tiny_run) -> None:
+    _, still, random, first, last, end = tiny_run.lines
+    front = ParetoFront.load(tiny_run.result.folder / "front.npz")
+    for name in ("preferences", "returns", "discounted_returns", "episode_lengths"):
+        np.testing.assert_array_equal(end["front"][name], getattr(front, name))
+    np.testing.assert_array_equal(last["values"], front.values)
+    for line, metrics in zip((first, last), tiny_run.result.metrics, strict=True):
+        assert {name: line[name] for name in METRICS} == metrics
+    for line in (still, random):
+        assert {name: line[name] for name in METRICS} == tiny_run.result.floors[line["policy"]]
+
+
+def test_the_metrics_follow_from_the_values(tiny_run) -> None:
+    start, *rest, _ = tiny_run.lines
+    for line in rest:
+        expected = summarise(line["values"], start["preferences"], start["reference_point"])
+        assert {name: line[name] for name in METRICS} == pytest.approx(expected)
+
+
+def test_seconds_are_of_training_and_evaluations_apart(tmp_path, monkeypatch) -> None:
+    """A clock that goes on by 1 in each step of the training and by 100 in each evaluation."""
+    clock = [0.0]
+
+    class Timed(StubEnv):
+        def step(self, action: np.ndarray) -> Any:
+            clock[0] += 1
+            return super().step(action)
+
+    def timed_evaluation(*args: Any, **kwargs: Any) -> ParetoFront:
+        clock[0] += 100
+        return evaluate_front(*args, **kwargs)
+
+    monkeypatch.setattr(callbacks, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(callbacks, "evaluate_front", timed_evaluation)
+    writer = writer_of(tmp_path / "record.jsonl")
+    callback = ParetoEvalCallback(
+        StubEnv, eval_freq=10, n_preferences=3, n_episodes=1, callback_after_eval=RecordCallback(writer)
+    )
+    tiny_model(Timed(), learning_starts=100).learn(30, callback=callback)
+    evaluations = [line for line in lines_of(writer.path) if line["event"] == "evaluation"]
+    times = [(line["steps"], line["seconds"], line["evaluation_seconds"]) for line in evaluations]
+    assert times == [(10, 10, 100), (20, 20, 200), (30, 30, 300)]
+
+
+def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:
+    config = tiny_run.lines[0]["config"]
+    assert set(config) == {field.name for field in fields(RunSettings)} - {"output", "progress_bar"}
+    assert (config["steps"], config["eval_freq"], config["n_episodes"], config["policy"]) == (120, 60, 2, "SimbaPolicy")
+    written = config["hyperparameters"]
+    arguments = inspect.signature(MOMBA.__init__).parameters
+    of_the_run = {"self", "policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}
+    assert set(written) == set(arguments) - of_the_run
+    for name in set(written) - {"policy_kwargs", *TINY}:
+        assert written[name] == arguments[name].default, name
+    assert {name: written[name] for name in TINY if name != "policy_kwargs"} == {
+        name: value for name, value in TINY.items() if name != "policy_kwargs"
+    }
+    policy = written["policy_kwargs"]
+    assert TINY_SIMBA.items() <= policy.items()
+    assert (policy["support"], policy["conditioning"], policy["normalize_weights"]) == ([-5.0, 5.0], "input", True)
+
+
+@pytest.mark.parametrize("policy", ["SimbaPolicy", "MlpPolicy"])
+def test_defaults_are_arguments_that_the_policy_takes(policy: str) -> None:
+    """What a run uses can be asked for: MlpPolicy has no weight normalisation, so its record may not say that it is on."""
+    complete = with_defaults(policy, {})
+    check_hyperparameters(policy, complete)
+    given = {"gamma": 0.5, "policy_kwargs": {"n_critics": 3}}
+    changed = with_defaults(policy, given)
+    assert (changed["gamma"], changed["policy_kwargs"]["n_critics"]) == (0.5, 3)
+    assert given == {"gamma": 0.5, "policy_kwargs": {"n_critics": 3}}
+    assert set(changed) == set(complete)
+    assert set(changed["policy_kwargs"]) == set(complete["policy_kwargs"])
+
+
+def test_parameters_are_the_trained_ones(tiny_run) -> None:
+    model = MOMBA.load(tiny_run.result.folder / "model.zip", device="cpu")
+    counts = {
+        name: sum(p.numel() for p in getattr(model, name).parameters() if p.requires_grad) for name in ("actor", "critic")
+    }
+    assert tiny_run.lines[0]["parameters"] == counts
+    assert sum(p.numel() for p in model.policy.parameters() if p.requires_grad) == sum(counts.values())
+
+
+def test_nothing_in_a_record_names_the_computer(tiny_run) -> None:
+    text = tiny_run.path.read_text()
+    for place in (tiny_run.result.folder, Path.home(), Path.cwd(), Path(system.__file__).parent):
+        assert str(place) not in text
+    for name in {platform.node(), getpass.getuser()} - {""}:
+        assert not re.search(rf"\b{re.escape(name)}\b", text), name
+
+    def strings(x: Any) -> Iterator[str]:
+        if isinstance(x, dict):
+            for key, value in x.items():
+                yield key
+                yield from strings(value)
+        elif isinstance(x, list):
+            for value in x:
+                yield from strings(value)
+        elif isinstance(x, str):
+            yield x
+
+    assert not [s for s in strings(tiny_run.lines) if os.path.isabs(s) or s.startswith("~") or "/home/" in s]
+
+
+def test_versions_machine_and_revision(tiny_run) -> None:
+    start = tiny_run.lines[0]
+    assert {"python", "sb3_momba", "stable_baselines3", "torch", "numpy", "gymnasium", "mujoco"} <= set(start["versions"])
+    assert all(isinstance(version, str) for version in start["versions"].values())
+    machine = start["machine"]
+    assert machine["cores"] >= 1
+    assert machine["memory_gb"] > 0
+    assert machine["torch_threads"] == th.get_num_threads()
+    assert start["git_revision"] is None or re.fullmatch(r"[0-9a-f]{40}(-dirty)?", start["git_revision"])
+
+
+def test_the_revision_is_of_the_repository_that_tracks_the_package(tmp_path, monkeypatch) -> None:
+    """An installed copy inside a stranger's repository is not of its revision; a tag does not take the commit's place."""
+    module = tmp_path / "system.py"
+    shutil.copy(system.__file__, module)
+    monkeypatch.setattr(system, "__file__", str(module))
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    for role in ("AUTHOR", "COMMITTER"):
+        monkeypatch.setenv(f"GIT_{role}_NAME", "A")
+        monkeypatch.setenv(f"GIT_{role}_EMAIL", "a@example.org")
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(tmp_path), *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    assert system.git_revision() is None
+    git("init")
+    assert system.git_revision() is None
+    git("add", "system.py")
+    git("commit", "--no-gpg-sign", "-m", "x")
+    git("tag", "v1")
+    revision = git("rev-parse", "HEAD")
+    assert system.git_revision() == revision
+    module.write_text(module.read_text() + "\n")
+    assert system.git_revision() == f"{revision}-dirty"
+    monkeypatch.setenv("PATH", "")
+    assert system.git_revision() is None
+
+
+@pytest.mark.parametrize(
+    ("setting", "written"),
+    [
+        ({"a": (1, "step")}, {"a": [1, "step"]}),
+        (th.optim.Adam, "torch.optim.adam.Adam"),
+        (preference_grid, "sb3_momba.envs.preferences.preference_grid"),
+        (np.float64(0.5), 0.5),
+        (np.array([0.5, 1.5]), [0.5, 1.5]),
+        (np.int64(64), 64),
+        (np.float32(0.5), 0.5),
+        (np.bool_(True), True),
+        (np.array([64, 32]), [64, 32]),
+    ],
+)
+def test_settings_as_json_holds_them(setting: Any, written: Any) -> None:
+    assert json.loads(json.dumps(plain(setting), allow_nan=False)) == written
+
+
+def test_settings_that_differ_are_written_differently() -> None:
+    """A sampler is a setting: two of different angles are two methods."""
+    narrow, wide = (plain(ConeSampler(2, angle)) for angle in (22.5, 45.0))
+    assert narrow != wide
+
+
+def test_reference_points_of_the_tasks() -> None:
+    assert set(REFERENCE_POINTS) <= set(gym.registry)
+    assert tuple(reference_point_of("MO-Hopper-3obj-v4", 3)) == (0.0, 0.0, 0.0)
+    assert tuple(reference_point_of("Unknown-v0", 4)) == (0.0,) * 4
+
+
+# ------------------------------------------------------------------------------------------------------------- floors
+
+
+def test_standing_still_is_a_rollout_of_zeros(tiny_run) -> None:
+    """Episode e starts from seed e; the same under every preference."""
+    env = gym.make(ENV, disable_env_checker=True)
+    returns = []
+    for seed in range(2):
+        env.reset(seed=seed)
+        total, ended = np.zeros(2), False
+        while not ended:
+            _, reward, terminated, truncated, _ = env.step(np.zeros(3, dtype=np.float32))
+            total += reward
+            ended = terminated or truncated
+        returns.append(total)
+    env.close()
+    np.testing.assert_allclose(tiny_run.lines[1]["values"], np.tile(np.mean(returns, axis=0), (3, 1)), rtol=1e-12)
+
+
+def test_floors_are_measured_as_learned_policies_are() -> None:
+    grid = preference_grid(2, 4)
+    state, torch_state = np.random.get_state()[1].tolist(), th.get_rng_state()  # noqa: NPY002
+    fronts = evaluate_floors(short_stub, grid, n_episodes=3)
+    assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
+    assert th.equal(th.get_rng_state(), torch_state)
+    assert set(fronts) == {"standing still", "random actions"}
+    for front in fronts.values():
+        np.testing.assert_allclose(front.preferences, grid, rtol=1e-6)
+        assert front.returns.shape == front.discounted_returns.shape == (4, 3, 2)
+        assert front.episode_lengths.tolist() == [[5] * 3] * 4
+        assert front.settings["seed"] == 0
+    again = evaluate_floors(short_stub, grid, n_episodes=3)
+    for name, front in fronts.items():
+        np.testing.assert_array_equal(front.returns, again[name].returns)
+
+
+def short_stub() -> StubEnv:
+    return StubEnv(episode_length=5)
+
+
+def test_the_actions_of_policies_that_learned_nothing() -> None:
+    space = spaces.Box(np.array([0.5, -2.0, -3.0]), np.array([1.0, 2.0, -1.0]), dtype=np.float64)
+    still, _ = ZeroActionPolicy(space).predict(np.zeros((4, 7)))
+    np.testing.assert_array_equal(still, np.tile([0.5, 0.0, -1.0], (4, 1)))
+    drawn = RandomPolicy(space, seed=1).predict(np.zeros((2_000, 7)))[0]
+    assert (drawn >= space.low).all()
+    assert (drawn <= space.high).all()
+    np.testing.assert_allclose(drawn.mean(axis=0), [0.75, 0.0, -2.0], atol=0.1)
+    np.testing.assert_array_equal(drawn, RandomPolicy(space, seed=1).predict(np.zeros((2_000, 7)))[0])
+
+
+def test_a_record_does_not_change_the_training(tiny_run) -> None:
+    """The same model trained by itself, without floors, evaluations and record, has the same front."""
+    settings = tiny_run.settings
+    env = make_mo_vec_env(ENV)
+    model = MOMBA(settings.policy, env, seed=settings.seed, device="cpu", **deepcopy(TINY)).learn(settings.steps)
+    env.close()
+    front = evaluate_front(model, ENV, n_preferences=3, n_episodes=2)
+    np.testing.assert_array_equal(front.returns, tiny_run.lines[-1]["front"]["returns"])
+
+
+# -------------------------------------------------------------------------------------------------------- append-only
+
+
+def test_a_record_is_not_written_over(valid) -> None:
+    before = valid.read_bytes()
+    with pytest.raises(FileExistsError, match=re.escape(str(valid))):
+        writer_of(valid)
+    assert valid.read_bytes() == before
+
+
+def test_each_line_is_on_disk_before_the_call_returns(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "deep" / "down" / "record.jsonl"
+    synchronised: list[int] = []
+    fsync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (synchronised.append(os.fstat(fd).st_size), fsync(fd))[1])
+    writer = writer_of(path)
+    content = path.read_bytes()
+    assert synchronised == [len(content)]
+    for i in range(3):
+        writer.append("evaluation", steps=i, seconds=0.0, values=[[1.0, 2.0]] * 3)
+        before, content = content, path.read_bytes()
+        assert content.startswith(before)
+        assert content[len(before) :].count(b"\n") == 1
+        assert content.endswith(b"\n")
+        assert synchronised[-1] == len(content)
+    writer.finish(3, front_of([[1.0, 2.0]] * 3))
+    assert path.read_bytes().startswith(content)
+    assert lines_of(path)[-1]["status"] == "finished"
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("boom"), KeyboardInterrupt(), SystemExit(3), MemoryError("too large"), ValueError("two\nlines")]
+)
+def test_an_error_inside_leaves_its_end(tmp_path, error: BaseException) -> None:
+    path = tmp_path / "record.jsonl"
+    with pytest.raises(type(error)) as raised, writer_of(path) as writer:  # noqa: PT012
+        writer.append("evaluation", steps=1, seconds=0.0, values=[[1.0, 2.0]] * 3)
+        raise error
+    assert raised.value is error
+    *_, end = lines_of(path)
+    assert (end["event"], end["status"]) == ("end", "failed")
+    assert type(error).__name__ in end["error"]
+    assert str(error) in end["error"]
+    record = read_record(path)
+    assert record.error == end["error"]
+    assert record.final_values is None
+    assert len(record.evaluations) == 1
+
+
+def test_a_line_that_a_full_disk_cut_off_does_not_swallow_the_end(tmp_path) -> None:
+    path = tmp_path / "record.jsonl"
+    with pytest.raises(OSError, match="No space left"), writer_of(path) as writer:  # noqa: PT012
+        writer.append("evaluation", steps=1, seconds=0.0, values=[[1.0, 2.0]] * 3)
+        with open(path, "a") as file:
+            file.write('{"event": "evaluation", "steps": 2, "val')
+        raise OSError(28, "No space left on device")
+    record = read_record(path)
+    assert record.error is not None
+    assert len(record.evaluations) == 1
+
+
+def test_a_finished_run_stays_finished(tmp_path) -> None:
+    """An end is the last line."""
+    path = tmp_path / "record.jsonl"
+    with pytest.raises(RuntimeError), writer_of(path) as writer:  # noqa: PT012
+        writer.finish(1, front_of([[1.0, 2.0]] * 3))
+        raise RuntimeError("afterwards")
+    assert [line["event"] for line in lines_of(path)] == ["start", "end"]
+    assert read_record(path).error is None
+
+
+NOT_FINITE = [math.nan, math.inf, -math.inf, np.float64("nan"), np.array([[1.0, np.inf]]), {"deep": [1.0, (math.nan,)]}]
+
+
+@pytest.mark.parametrize("number", NOT_FINITE, ids=repr)
+def test_a_number_that_is_not_finite_is_refused_before_anything_is_written(tmp_path, number: Any) -> None:
+    writer = writer_of(tmp_path / "record.jsonl")
+    before = writer.path.read_bytes()
+    with pytest.raises(ValueError):  # noqa: PT011
+        writer.append("evaluation", steps=1, seconds=0.0, values=number)
+    assert writer.path.read_bytes() == before
+    writer.append("evaluation", steps=1, seconds=0.0, values=[[1.0, 2.0]] * 3)
+    assert len(read_record(writer.path).evaluations) == 1
+
+
+@pytest.mark.parametrize("content", [{"config": {"bound": math.inf}}, {"reference_point": [0.0, math.nan]}])
+def test_a_start_that_is_refused_leaves_nothing(tmp_path, content: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011
+        writer_of(tmp_path / "record.jsonl", **content)
+    assert not (tmp_path / "record.jsonl").exists()
+    writer_of(tmp_path / "record.jsonl")
+
+
+def test_what_json_cannot_hold_is_an_error_that_names_it(tmp_path) -> None:
+    writer = writer_of(tmp_path / "record.jsonl")
+    before = writer.path.read_bytes()
+    with pytest.raises(TypeError, match="Path"):
+        writer.append("note", place=tmp_path)
+    assert writer.path.read_bytes() == before
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("diverged")], ids=repr)
+def test_a_run_that_breaks_off_leaves_a_readable_record(tmp_path, monkeypatch, error: BaseException) -> None:
+    def learn(model: MOMBA, *args: Any, **kwargs: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(MOMBA, "learn", learn)
+    settings = settings_of(tmp_path / "run", n_preferences=2, n_episodes=1)
+    with pytest.raises(type(error)):
+        run(settings)
+    record = read_record(tmp_path / "run" / "record.jsonl")
+    assert record.error is not None
+    assert type(error).__name__ in record.error
+    assert [floor.policy for floor in record.floors] == ["standing still", "random actions"]
+    assert record.evaluations == []
+
+
+def test_a_bound_that_is_infinite_is_a_setting_like_others(tmp_path, monkeypatch) -> None:
+    """Gymnasium's own default is healthy_z_range=(0.7, inf): who changes its lower end gives an infinite upper one."""
+
+    def learn(model: MOMBA, *args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(MOMBA, "learn", learn)
+    line = f"--env {ENV} --output {tmp_path / 'run'} --n-preferences 2 --n-episodes 1 --no-progress-bar --device cpu"
+    with pytest.raises(SystemExit) as stop:
+        main([*line.split(), "--set", "buffer_size=100", "--env-kwargs", "healthy_z_range=[0.5, .inf]"])
+    assert stop.value.code == 130, f"refused with {stop.value.code!r}; left {list((tmp_path / 'run').glob('*'))}"
+    start, *floors, _ = lines_of(tmp_path / "run" / "record.jsonl")
+    assert "0.5" in json.dumps(start["env_kwargs"])
+    assert len(floors) == 2
+
+
+# ------------------------------------------------------------------------------------------------------------ reading
+
+
+def test_a_record_reads_as_it_was_written(valid) -> None:
+    record = read_record(valid)
+    assert (record.label, record.env, record.env_kwargs, record.seed, record.error) == ("momba", "E", {}, 0, None)
+    assert record.config == {"hyperparameters": {"gamma": 0.99}}
+    np.testing.assert_array_equal(record.reference_point, [0, 0])
+    np.testing.assert_array_equal(record.preferences, PREFERENCES)
+    assert [floor.policy for floor in record.floors] == ["standing still", "random actions"]
+    assert [(e.steps, e.seconds) for e in record.evaluations] == [(10, 1.5), (20, 3.0)]
+    np.testing.assert_array_equal(record.evaluations[0].values, [[1, 2]] * 3)
+    np.testing.assert_array_equal(record.final_values, [[1, 3], [2, 2], [3, 1]])
+
+
+def test_a_real_record_reads(tiny_run) -> None:
+    record = read_record(str(tiny_run.path))
+    assert record.error is None
+    assert record.config == tiny_run.lines[0]["config"]
+    assert asdict(record)["start"] == tiny_run.lines[0]
+    np.testing.assert_allclose(record.final_values, tiny_run.result.front.values)
+
+
+def test_a_record_without_an_end_is_not_finished(valid) -> None:
+    lines = valid.read_bytes().splitlines(keepends=True)
+    valid.write_bytes(b"".join(lines[:-1]))
+    record = read_record(valid)
+    assert record.error is not None
+    assert record.final_values is None
+    assert len(record.evaluations) == 2
+
+
+def test_a_line_that_was_cut_off_while_it_was_written_is_ignored(valid) -> None:
+    whole = valid.read_bytes()
+    ends = [i + 1 for i, byte in enumerate(whole) if byte == ord("\n")]
+    rng = np.random.default_rng(0)
+    for start, end, n_evaluations in ((ends[2], ends[3], 0), (ends[3], ends[4], 1), (ends[4], ends[5], 2)):
+        for cut in [start, start + 1, end - 2, *rng.integers(start, end - 1, 10)]:
+            valid.write_bytes(whole[:cut])
+            record = read_record(valid)
+            assert record.error is not None
+            assert len(record.evaluations) == n_evaluations
+
+
+def refused(path: Path) -> str:
+    """The message of the error, which names the file."""
+    with pytest.raises(FileFormatError) as error:
+        read_record(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("line", [b"{", b"", b"not json", b"[1, 2]", b"7", b'{"steps": 1}', b'{"event": 3}', b"\xff\xfe\x00"])
+def test_a_bad_line_in_the_middle_is_named(valid, line: bytes) -> None:
+    lines = valid.read_bytes().split(b"\n")
+    lines[3] = line
+    valid.write_bytes(b"\n".join(lines))
+    assert "line 4" in refused(valid)
+
+
+@pytest.mark.parametrize(
+    ("version", "versions"),
+    [(2, {"sb3_momba": "9.9"}), (0, {}), ("1", {}), (None, {}), ([1], {}), (2, "absent"), (2, None), (2, ["sb3_momba 9.9"])],
+)
+def test_another_version_is_named_beside_the_one_that_is_read(valid, version: Any, versions: Any) -> None:
+    def newer(events: list[dict[str, Any]]) -> None:
+        events[0].update(version=version, versions=versions, reference_point="elsewhere")
+        if versions == "absent":
+            del events[0]["versions"]
+
+    rewrite(valid, newer)
+    message = refused(valid)
+    assert f"version {version!r}" in message
+    assert "version 1" in message
+
+
+def rewrite(path: Path, change: Callable[[list[dict[str, Any]]], Any]) -> None:
+    events = [json.loads(line) for line in path.read_text().splitlines()]
+    change(events)
+    path.write_text("".join(json.dumps(event) + "\n" for event in events))
+
+
+def put(*place: Any) -> Callable[[list[dict[str, Any]]], None]:
+    """put(line, key, ..., value): a change of one value."""
+    *keys, last, value = place
+
+    def change(events: Any) -> None:
+        for key in keys:
+            events = events[key]
+        events[last] = value
+
+    return change
+
+
+BAD_VALUES = {
+    "another format": put(0, "format", "sb3_momba.front"),
+    "no format": lambda events: events[0].pop("format"),
+    "no start": lambda events: events.pop(0),
+    "two starts": lambda events: events.append(events[0]),
+    "unknown event": put(2, "event", "intermezzo"),
+    "no label": lambda events: events[0].pop("label"),
+    "no seed": lambda events: events[0].pop("seed"),
+    "no configuration": lambda events: events[0].pop("config"),
+    "a configuration of numbers": put(0, "config", 7),
+    "a scalar reference point": put(0, "reference_point", 0.0),
+    "an empty reference point": put(0, "reference_point", []),
+    "a reference point of another length": put(0, "reference_point", [0.0, 0.0, 0.0]),
+    "no preferences": put(0, "preferences", []),
+    "ragged preferences": put(0, "preferences", [[0.0, 1.0], [1.0]]),
+    "a floor of words": put(1, "values", [["a", "b"]] * 3),
+    "a floor without values": lambda events: events[1].pop("values"),
+    "more values than preferences": put(3, "values", [[1.0, 2.0]] * 4),
+    "flat values": put(3, "values", [1.0, 2.0]),
+    "values of 3 objectives": put(3, "values", [[1.0, 2.0, 3.0]] * 3),
+    "a value that is null": put(3, "values", [[1.0, None]] * 3),
+    "a value that is a huge integer": put(3, "values", [[1.0, 10**400]] * 3),
+    "an evaluation without steps": lambda events: events[3].pop("steps"),
+    "steps that are a huge integer": put(3, "steps", 10**400),
+    "steps that are a list": put(3, "steps", [10]),
+    "seconds that are words": put(3, "seconds", "soon"),
+    "seconds that are nan in words": put(3, "seconds", "nan"),
+    "an end without status": lambda events: events[-1].pop("status"),
+    "an end without front": lambda events: events[-1].pop("front"),
+    "a failure without error": put(-1, "status", "failed"),
+    "returns without episodes": put(-1, "front", "returns", [[1.0, 2.0]] * 3),
+    "returns of no episode": put(-1, "front", "returns", [[]] * 3),
+    "returns of other preferences": put(-1, "front", "returns", [[[1.0, 2.0]]] * 2),
+}
+
+
+@pytest.mark.parametrize("change", BAD_VALUES.values(), ids=BAD_VALUES)
+def test_what_does_not_fit_is_refused(valid, change: Callable[[list[dict[str, Any]]], Any]) -> None:
+    rewrite(valid, change)
+    refused(valid)
+
+
+@pytest.mark.parametrize(
+    ("place", "number"),
+    [
+        *(
+            (place, number)
+            for place in ('"seconds": 1.5', "1.0", '"gamma": 0.99')
+            for number in ("NaN", "Infinity", "-Infinity")
+        ),
+        *((place, number) for place in ('"seconds": 1.5', "1.0") for number in ("1e999", "-1e999")),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(valid, place: str, number: str) -> None:
+    """1e999 is strict JSON that Python reads as infinity."""
+    text = valid.read_text()
+    assert place in text
+    valid.write_text(text.replace(place, re.sub(r"[\d.]+$", number, place), 1))
+    refused(valid)
+
+
+GARBAGE = {
+    "empty": b"",
+    "one line break": b"\n",
+    "only a torn line": b'{"event": "start", "format": "sb3_momba.record", "ver',
+    "binary": bytes(range(256)) * 10,
+    "a zip": b"PK\x03\x04" + b"\0" * 100 + b"\n",
+    "utf-16": '{"event": "start"}\n'.encode("utf-16"),
+    "nested": b"[" * 100_000 + b"\n",
+    "nested dictionaries": b'{"event":' * 100_000 + b"\n",
+    "a huge integer": b'{"event": "start", "version": ' + b"9" * 10_000 + b"}\n",
+}
+
+
+@pytest.mark.parametrize("content", GARBAGE.values(), ids=GARBAGE)
+def test_garbage_is_refused(tmp_path, content: bytes) -> None:
+    path = tmp_path / "record.jsonl"
+    path.write_bytes(content)
+    refused(path)
+
+
+def test_a_folder_is_no_record(tmp_path) -> None:
+    refused(tmp_path)
+
+
+def test_a_missing_record_is_missing(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_record(tmp_path / "nowhere.jsonl")
+
+
+def reads_or_is_refused(path: Path) -> Record | None:
+    try:
+        record = read_record(path)
+    except FileFormatError as error:
+        assert str(path) in str(error)  # noqa: PT017
+        return None
+    for values in [*(e.values for e in record.evaluations), *(floor.values for floor in record.floors)]:
+        assert values.shape == record.preferences.shape
+        assert np.isfinite(values).all()
+    assert (record.final_values is not None) == (record.error is None)
+    assert np.isfinite(np.array([(e.steps, e.seconds) for e in record.evaluations], dtype=np.float64)).all()
+    return record
+
+
+def test_damaged_bytes_are_read_or_refused(valid) -> None:
+    whole = valid.read_bytes()
+    rng = np.random.default_rng(0)
+    outcomes = set()
+    for trial in range(300):
+        content = bytearray(whole)
+        for _ in range(rng.integers(1, 4)):
+            i, j = sorted(int(x) for x in rng.integers(0, len(content), 2))
+            kind = (trial + _) % 5
+            if kind == 0:
+                content[i] = int(rng.integers(256))
+            elif kind == 1:
+                content[i : i + 3] = b""
+            elif kind == 2:
+                content[i:i] = rng.choice([b"0", b"9" * 30, b"e9", b"-", b"\n", b"null", b'"', b"]"])
+            elif kind == 3:
+                content = content[: max(i, j)]
+            else:
+                content[i:i] = content[i : min(j, i + 200)]
+            if not content:
+                break
+        valid.write_bytes(bytes(content))
+        outcomes.add(reads_or_is_refused(valid) is None)
+    assert outcomes == {True, False}
+
+
+ODD_VALUES = [
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1,
+    10**20,
+    10**400,
+    1e308,
+    0.5,
+    "",
+    "a",
+    "nan",
+    [],
+    [[]],
+    [1.0, 2.0],
+    {},
+    {"a": 1},
+    [None],
+]
+
+
+def places(x: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where in nested lists and dictionaries something is."""
+    items = x.items() if isinstance(x, dict) else enumerate(x) if isinstance(x, list) else ()
+    for key, value in items:
+        yield (*here, key)
+        yield from places(value, (*here, key))
+
+
+def test_damaged_values_are_read_or_refused(valid) -> None:
+    events = [json.loads(line) for line in valid.read_text().splitlines()]
+    everywhere = list(places(events))
+    rng = np.random.default_rng(1)
+    outcomes = set()
+    for trial in range(400):
+        changed = deepcopy(events)
+        place = everywhere[rng.integers(len(everywhere))]
+        target: Any = changed
+        for key in place[:-1]:
+            target = target[key]
+        kind = trial % 4
+        if kind == 0:
+            del target[place[-1]]
+        elif kind == 1 and isinstance(target, list):
+            target.append(deepcopy(target[place[-1]]))
+        else:
+            target[place[-1]] = ODD_VALUES[rng.integers(len(ODD_VALUES))]
+        valid.write_text("".join(json.dumps(event) + "\n" for event in changed))
+        outcomes.add(reads_or_is_refused(valid) is None)
+    assert outcomes == {True, False}
+
+
+# ----------------------------------------------------------------------------------------------------- finding records
+
+
+def test_records_are_found_in_files_and_folders_once(tmp_path, monkeypatch) -> None:
+    for name in ("b/1/record.jsonl", "b/0/record.jsonl", "a/record.jsonl", "single.jsonl"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "b" / "notes.txt").touch()
+    (tmp_path / "plain-name").touch()
+    names = ["b/0/record.jsonl", "b/1/record.jsonl"]
+    assert find_records([tmp_path / "b"]) == [tmp_path / name for name in names]
+    everything = [tmp_path / name for name in ("a/record.jsonl", *names, "single.jsonl")]
+    assert find_records([tmp_path]) == everything
+    assert find_records([str(tmp_path), tmp_path / "b", tmp_path / "a" / "record.jsonl"]) == everything
+    assert find_records([tmp_path / "single.jsonl", tmp_path / "a"]) == [everything[-1], everything[0]]
+    assert find_records([tmp_path / "plain-name"]) == [tmp_path / "plain-name"]
+    monkeypatch.chdir(tmp_path)
+    assert find_records(["single.jsonl", tmp_path / "single.jsonl", "./b/../single.jsonl"]) == [tmp_path / "single.jsonl"]
+
+
+def test_a_folder_named_like_a_record_is_none(tmp_path) -> None:
+    (tmp_path / "old.jsonl").mkdir()
+    (tmp_path / "old.jsonl" / "record.jsonl").touch()
+    assert find_records([tmp_path]) == [tmp_path / "old.jsonl" / "record.jsonl"]
+
+
+def test_a_missing_path_and_a_folder_without_records_are_errors(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match=re.escape(str(tmp_path / "nowhere"))):
+        find_records([tmp_path, tmp_path / "nowhere"])
+    for paths in ([tmp_path], iter([tmp_path])):
+        with pytest.raises(FileNotFoundError, match=re.escape(str(tmp_path))):
+            find_records(paths)
