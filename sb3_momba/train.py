@@ -39,6 +39,7 @@ from sb3_momba.zoo.configuration import (
 )
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
+NOT_RECORDED = ("output", "progress_bar", "eval_workers")  # No result depends on them.
 
 
 @dataclass
@@ -50,6 +51,7 @@ class RunSettings:
     :param env_kwargs: of the environment, such as {"physics": "current"}
     :param output: the run's folder; must not hold a run already
     :param eval_freq: environment steps between evaluations
+    :param eval_workers: processes that share an evaluation
     :param reference_point: of the hypervolume; None: the task's in `pareto/protocol.py`
     """
 
@@ -68,6 +70,7 @@ class RunSettings:
     n_episodes: int = protocol.N_EPISODES
     reference_point: list[float] | None = None
     objectives: list[str] | None = None
+    eval_workers: int = 1
     device: str = "auto"
     progress_bar: bool = True
 
@@ -103,6 +106,7 @@ def run(settings: RunSettings) -> RunResult:
             n_episodes=settings.n_episodes,
             reference_point=reference_point,
             objectives=settings.objectives,
+            n_workers=settings.eval_workers,
             log_path=folder,
             best_model_save_path=folder,
             callback_after_eval=RecordCallback(record),
@@ -149,7 +153,7 @@ def description(
 
 def recorded_settings(settings: RunSettings) -> dict[str, Any]:
     """Every setting that a result depends on, defaults included, as JSON holds it."""
-    config = {name: value for name, value in asdict(settings).items() if name not in ("output", "progress_bar")}
+    config = {name: value for name, value in asdict(settings).items() if name not in NOT_RECORDED}
     config["hyperparameters"] = with_defaults(settings.policy, settings.hyperparameters)
     return dict(plain(config))
 
@@ -212,6 +216,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     evaluation.add_argument(
         "--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0"
     )
+    evaluation.add_argument("--eval-workers", type=int, default=1, help="processes that share an evaluation")
     evaluation.add_argument("--objectives", nargs="+", help="names for the picture's axes")
 
     given = parser.parse_args(arguments)
@@ -245,6 +250,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         n_episodes=given.n_episodes,
         reference_point=given.reference_point,
         objectives=given.objectives,
+        eval_workers=given.eval_workers,
         device=given.device,
         progress_bar=not given.no_progress_bar,
     )

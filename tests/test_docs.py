@@ -26,7 +26,7 @@ def test_no_placeholder_is_left(page: Path) -> None:
 
 def test_the_functions_beside_the_equations_exist() -> None:
     page = (ROOT / "docs" / "algorithm.md").read_text()
-    names = re.findall(r"`((?:nn|momba|envs|buffers|pareto|MOMBA)\.[\w.*]+)`", page)
+    names = re.findall(r"`((?:nn|momba|envs|buffers|pareto|benchmark|MOMBA)\.[\w.*]+)`", page)
     assert len(names) > 25
     for name in names:
         for full in [name.replace("*", kind) for kind in ("DistributionalValue", "ExpectedValue")] if "*" in name else [name]:

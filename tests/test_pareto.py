@@ -1339,3 +1339,40 @@ def test_floors_are_evaluated_like_models():
     assert (wild.returns[:, :, 0] == [12, 30, 6]).all()
     assert (np.abs(wild.returns[:, :, 1]) <= [3, 6, 1]).all()
     assert len(np.unique(wild.returns[:, :, 1])) == 9
+
+
+# ------------------------------------------------------------------------------------------------------------ workers
+
+
+@pytest.mark.parametrize("n_workers", [2, 3])
+def test_fronts_are_bit_equal_for_any_number_of_workers_and_preferences(n_workers):
+    model = MOMBA("SimbaPolicy", "MO-Walker2d-v4", seed=1, buffer_size=10)
+    alone = evaluate_front(model, "MO-Walker2d-v4", n_preferences=20)
+    assert len(np.unique(alone.episode_lengths)) > 1
+    shared = evaluate_front(model, "MO-Walker2d-v4", n_preferences=20, n_workers=n_workers)
+    for name in ("preferences", "returns", "discounted_returns", "episode_lengths"):
+        np.testing.assert_array_equal(getattr(shared, name), getattr(alone, name))
+    few = evaluate_front(model, "MO-Walker2d-v4", preferences=alone.preferences[:2])
+    np.testing.assert_array_equal(few.returns, alone.returns[:2])
+
+
+def test_workers_take_environments_from_a_function_and_any_policy():
+    alone = evaluate_front(FirstWeight(), SeededEnv, n_preferences=5, n_episodes=3)
+    shared = evaluate_front(FirstWeight(), SeededEnv, n_preferences=5, n_episodes=3, n_workers=2)
+    np.testing.assert_array_equal(shared.returns, alone.returns)
+
+
+@pytest.mark.parametrize(("env", "n_workers"), [(make_mo_vec_env(SeededEnv, 1), 2), (SeededEnv(), 2), (SeededEnv, 0)])
+def test_workers_that_cannot_be_are_refused(env, n_workers):
+    with pytest.raises(ValueError, match=rf"n_workers={n_workers}: at least one; more of them need an id or a callable"):
+        evaluate_front(FirstWeight(), env, n_workers=n_workers)
+
+
+def test_an_error_in_a_worker_reaches_the_caller():
+    with pytest.raises(RuntimeError, match="no answer"):
+        evaluate_front(Speechless(), SeededEnv, n_preferences=4, n_workers=2)
+
+
+class Speechless:
+    def predict(self, observation, *, deterministic):
+        raise RuntimeError("no answer")

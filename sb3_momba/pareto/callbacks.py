@@ -39,6 +39,7 @@ class ParetoEvalCallback(EventCallback):
     :param best_model_save_path: folder for `best_model.zip`, the model of the largest hypervolume
     :param callback_on_new_best: called after each new best hypervolume
     :param callback_after_eval: called after each evaluation; may stop the training
+    :param n_workers: processes that share the episodes of an evaluation
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class ParetoEvalCallback(EventCallback):
         callback_on_new_best: BaseCallback | None = None,
         callback_after_eval: BaseCallback | None = None,
         objectives: list[str] | None = None,
+        n_workers: int = 1,
         verbose: int = 0,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
@@ -67,6 +69,7 @@ class ParetoEvalCallback(EventCallback):
             "n_episodes": n_episodes,
             "seed": seed,
             "deterministic": deterministic,
+            "n_workers": n_workers,
         }
         self.reference_point = reference_point
         self.log_path = None if log_path is None else Path(log_path)

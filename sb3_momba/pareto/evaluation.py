@@ -1,21 +1,26 @@
 """Rolling out a policy under a grid of preferences (section 4.1.2)."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, fields
+from multiprocessing import get_all_start_methods, get_context
+from multiprocessing.context import BaseContext
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from numpy.typing import ArrayLike, NDArray
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.files import FileFormatError, FilePath, read_tree, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.pareto import metrics
 
-MAX_PARALLEL_EPISODES = 128
+MAX_PARALLEL_EPISODES = BATCH = 128
 FRONT_FORMAT = "sb3_momba.front"
 
 Array = NDArray[np.float64]
@@ -100,11 +105,13 @@ def evaluate_front(
     gamma: float | None = None,
     deterministic: bool = True,
     env_kwargs: dict[str, Any] | None = None,
+    n_workers: int = 1,
 ) -> ParetoFront:
     """Roll a policy out under each preference, all episodes together, one `predict` per step.
 
     Episode e of every preference starts from seed + e. An environment class without any randomness may declare
-    `deterministic = True`: with a deterministic policy one episode then stands for all.
+    `deterministic = True`: with a deterministic policy one episode then stands for all. The policy always sees batches of
+    one shape, so that the result of a deterministic one is the same, bit for bit, for any `n_workers`.
 
     :param model: anything with `predict` on observations [s, w]
     :param env: an id or a callable runs up to 128 copies side by side; a VecEnv as many as it has; an environment that
@@ -113,8 +120,12 @@ def evaluate_front(
     :param preferences: to evaluate instead, (P, n_objectives)
     :param gamma: of the discounted returns; the model's own by default, 0.99 where it has none
     :param deterministic: the policy's mean action
+    :param n_workers: processes that share the episodes; for an id or a callable. As with SB3's SubprocVecEnv, a script needs
+        `if __name__ == "__main__":`
     :return: P preferences in the order of the grid
     """
+    if n_workers < 1 or (n_workers > 1 and isinstance(env, VecEnv | gym.Env)):
+        raise ValueError(f"n_workers={n_workers}: at least one; more of them need an id or a callable that makes environments.")
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes}: at least one episode is needed.")
     gamma = float(getattr(model, "gamma", 0.99)) if gamma is None else gamma
@@ -127,12 +138,19 @@ def evaluate_front(
     n_run = 1 if probe.deterministic and deterministic else n_episodes
     jobs = [(w, int(seed) + episode) for w in grid for episode in range(n_run)]
 
-    venv, is_ours = _make_vec_env(env, min(len(jobs), MAX_PARALLEL_EPISODES), env_kwargs)
-    try:
-        returns, discounted, lengths = _run_jobs(model, venv, jobs, gamma, deterministic)
-    finally:
-        if is_ours:
-            venv.close()
+    if n_workers == 1:
+        returns, discounted, lengths = _run_jobs(model, env, env_kwargs, jobs, gamma, deterministic)
+    else:
+        policy = model.policy if isinstance(model, BaseAlgorithm) else model  # without environments and replay buffer
+        parts = [jobs[i::n_workers] for i in range(n_workers)]
+        runs = [(policy, env, env_kwargs, part, gamma, deterministic) for part in parts if part]
+        with ProcessPoolExecutor(len(runs), mp_context=_worker_context()) as pool:
+            results = list(pool.map(_run_pickled, map(CloudpickleWrapper, runs)))
+        n_objectives = grid.shape[1]
+        returns, discounted = np.zeros((2, len(jobs), n_objectives))
+        lengths = np.zeros(len(jobs), dtype=np.int64)
+        for i, result in enumerate(results):
+            returns[i::n_workers], discounted[i::n_workers], lengths[i::n_workers] = result
     settings = {
         "env": probe.name,
         "seed": seed,
@@ -144,11 +162,49 @@ def evaluate_front(
     return ParetoFront(grid, returns.reshape(*shape, -1), discounted.reshape(*shape, -1), lengths.reshape(shape), settings)
 
 
+Jobs = Sequence[tuple[np.ndarray, int]]
+Measured = tuple[Array, Array, NDArray[np.int64]]
+
+
+def _worker_context() -> BaseContext:
+    """Processes that start from a clean one, which has the package loaded already."""
+    if "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["sb3_momba"])
+    return context
+
+
+def _run_pickled(run: CloudpickleWrapper) -> Measured:
+    return _run_jobs(*run.var)
+
+
 def _run_jobs(
-    model: Predictor, venv: VecEnv, jobs: Sequence[tuple[np.ndarray, int]], gamma: float, deterministic: bool
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Each environment takes the next (preference, seed) as soon as its episode ends; idle ones go on unheard, so that the
-    policy always sees one batch shape."""
+    model: Predictor,
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env],
+    env_kwargs: dict[str, Any] | None,
+    jobs: Jobs,
+    gamma: float,
+    deterministic: bool,
+) -> Measured:
+    """Returns (n_jobs, n_objectives), discounted ones, and lengths (n_jobs,)."""
+    venv, is_ours = _make_vec_env(env, min(len(jobs), MAX_PARALLEL_EPISODES), env_kwargs)
+    n_threads = th.get_num_threads()
+    # Sampling actions must not disturb the random numbers of a training that is going on.
+    with th.random.fork_rng(enabled=not deterministic):
+        if not deterministic:
+            th.manual_seed(jobs[0][1])
+        try:
+            th.set_num_threads(1)  # More of them only slow such small products down, and could round them differently.
+            return _run_episodes(model, venv, jobs, gamma, deterministic)
+        finally:
+            th.set_num_threads(n_threads)
+            if is_ours:
+                venv.close()
+
+
+def _run_episodes(model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, deterministic: bool) -> Measured:
+    """Each environment takes the next (preference, seed) as soon as its episode ends; idle ones go on unheard."""
     n_objectives = jobs[0][0].size
     returns, discounted = np.zeros((2, len(jobs), n_objectives))
     lengths = np.zeros(len(jobs), dtype=np.int64)
@@ -166,24 +222,30 @@ def _run_jobs(
 
     for index in range(venv.num_envs):
         start_next(index)
-    # Sampling actions must not disturb the random numbers of a training that is going on.
-    with th.random.fork_rng(enabled=not deterministic):
-        if not deterministic:
-            th.manual_seed(jobs[0][1])
-        while any(job is not None for job in job_of):
-            actions, _ = model.predict(observations, deterministic=deterministic)
-            next_observations, scalars, dones, infos = venv.step(actions)
-            observations = np.array(next_observations)
-            for index, job in enumerate(job_of):
-                if job is None:
-                    continue
-                reward = np.asarray(infos[index].get("vector_reward", [scalars[index]]), dtype=np.float64)
-                returns[job] += reward
-                discounted[job] += gamma ** lengths[job] * reward
-                lengths[job] += 1
-                if dones[index]:
-                    start_next(index)
+    while any(job is not None for job in job_of):
+        next_observations, scalars, dones, infos = venv.step(_predict(model, observations, deterministic))
+        observations = np.array(next_observations)
+        for index, job in enumerate(job_of):
+            if job is None:
+                continue
+            reward = np.asarray(infos[index].get("vector_reward", [scalars[index]]), dtype=np.float64)
+            returns[job] += reward
+            discounted[job] += gamma ** lengths[job] * reward
+            lengths[job] += 1
+            if dones[index]:
+                start_next(index)
     return returns, discounted, lengths
+
+
+def _predict(model: Predictor, observations: np.ndarray, deterministic: bool) -> np.ndarray:
+    """Actions of any number of observations, of a network in batches of one shape: products round differently with it."""
+    if not isinstance(model, BaseAlgorithm | BasePolicy):
+        return model.predict(observations, deterministic=deterministic)[0]
+    n = len(observations)
+    n_batches = -(-n // BATCH)
+    padded = observations[np.minimum(np.arange(n_batches * BATCH), n - 1)]
+    batches = [model.predict(batch, deterministic=deterministic)[0] for batch in np.split(padded, n_batches)]
+    return np.concatenate(batches)[:n]
 
 
 @dataclass
