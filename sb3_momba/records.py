@@ -3,21 +3,23 @@
 A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has an `event`:
 
 - `start`, the first line: `format`, `version`, `label` (the method's name), `env`, `env_kwargs`, `seed`, `config` (every
-  setting of the run, defaults included), `reference_point` (n_objectives,), `preferences` (P, n_objectives), `parameters`
-  (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
-- `floor`, one for each policy that learned nothing: `policy`, `values` (P, n_objectives) and the metrics.
-- `evaluation`, one for each point of the curve: `steps`, `seconds` (of training, without evaluations),
-  `evaluation_seconds` (so far), the metrics and `values` (P, n_objectives), mean undiscounted returns in the order of
-  `preferences`.
-- `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `preferences` (P, n_objectives),
-  `returns` and `discounted_returns` (P, episodes, n_objectives), `episode_lengths` (P, episodes) and its `settings`; one that
+  setting of the run, defaults included), `reference_point` (n_objectives,), `preferences` (P, n_objectives),
+  `general_policy`, `parameters` (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
+- `floor`, one for each policy that learned nothing: `policy`, `values` (n, n_objectives) and the metrics.
+- `evaluation`, one for each point of the curve: `steps`, which rise, `seconds` (of training, without evaluations),
+  `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives).
+- `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `returns` and `discounted_returns`
+  (n, episodes, n_objectives), `episode_lengths` (n, episodes), the `preferences` that they answer and its `settings`; one that
   "failed" has its `error`.
+
+Values are mean undiscounted returns. With `general_policy` they are those of one policy under each preference, in their order,
+and n is P; without it they are a set of n solutions, such as the policies of PGMORL, and there is no `preference_regret`.
 
 A record without an `end` is of a run that still goes on or was killed. The metrics (`hypervolume`, `expected_utility`,
 `preference_regret`, `n_non_dominated`) are there for the reader's convenience: they follow from the values.
 """
 
-import io
+import errno
 import json
 import math
 import os
@@ -45,7 +47,8 @@ Array = NDArray[np.float64]
 class RecordWriter:
     """Appends to a new record, each line on disk before the call returns.
 
-    `with writer.start(...):` writes the first line, and the failure if what is inside raises.
+    `with writer.start(...):` writes the first line, and the failure if what is inside fails. What is interrupted (Ctrl-C,
+    SystemExit) has no end, like what is killed.
 
     :param path: of the record, which must not exist
     """
@@ -60,25 +63,25 @@ class RecordWriter:
         now = datetime.now(timezone.utc).isoformat(timespec="seconds")
         line = _line("start", format=FORMAT, version=VERSION, **content, **provenance, started=now)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._write(line, "xb")
+        # Held until the end: whoever deletes the record does not find lines of this run in the next one.
+        self.file = open(self.path, "ab", buffering=0, opener=_only_new)  # noqa: SIM115
+        self._write(line)
         return self
 
     def append(self, event: str, **content: Any) -> None:
         """:raises ValueError: for numbers that are not finite, before anything is written"""
-        self._write(_line(event, **content), "ab")
+        self._write(_line(event, **content))
 
-    def _write(self, line: bytes, mode: str) -> None:
+    def _write(self, line: bytes) -> None:
         """The whole line or, if the disk is full, nothing of it."""
-        with open(self.path, mode, buffering=0) as file:
-            size = os.fstat(file.fileno()).st_size
-            try:
-                with io.BufferedWriter(file) as buffer:  # type: ignore[arg-type]
-                    buffer.write(line)
-                    buffer.flush()
-                    os.fsync(file.fileno())
-            except BaseException:
-                os.truncate(self.path, size)
-                raise
+        size = os.fstat(self.file.fileno()).st_size
+        try:
+            if self.file.write(line) != len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(self.path))
+            os.fsync(self.file.fileno())
+        except BaseException:
+            os.ftruncate(self.file.fileno(), size)
+            raise
 
     def finish(self, steps: int, front: dict[str, Any]) -> None:
         """:param front: the attributes of a ParetoFront"""
@@ -89,9 +92,14 @@ class RecordWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        if error is not None and not self.is_ended:
-            self.is_ended = True
-            self.append("end", status="failed", error=f"{type(error).__name__}: {error}".removesuffix(": "))
+        with self.file:
+            if isinstance(error, Exception) and not self.is_ended:
+                self.is_ended = True
+                self.append("end", status="failed", error=f"{type(error).__name__}: {error}".removesuffix(": "))
+
+
+def _only_new(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_EXCL, 0o666)
 
 
 def _line(event: str, **content: Any) -> bytes:
@@ -124,7 +132,7 @@ def plain(x: Any) -> Any:
 
 @dataclass(frozen=True)
 class Floor:
-    """What a policy earns that learned nothing: its mean returns, (P, n_objectives)."""
+    """What a policy earns that learned nothing: its mean returns, (n, n_objectives)."""
 
     policy: str
     values: Array
@@ -132,7 +140,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One point of the curve; `seconds` of training, `values` (P, n_objectives)."""
+    """One point of the curve; `seconds` of training, `values` (n, n_objectives)."""
 
     steps: int
     seconds: float
@@ -151,6 +159,7 @@ class Record:
     config: dict[str, Any]
     reference_point: Array
     preferences: Array
+    general_policy: bool
     parameters: dict[str, int]
     start: dict[str, Any]
     floors: list[Floor]
@@ -179,6 +188,11 @@ def find_records(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
     if not found:
         raise FileNotFoundError(f"No record (*.jsonl) lies in {', '.join(map(str, given))}.")
     return list(dict.fromkeys(path.resolve() for path in found))
+
+
+def is_cut_off_at_its_start(path: Path) -> bool:
+    """Whether not even the first line of a record was written to its end."""
+    return b"\n" not in path.read_bytes()
 
 
 def read_record(path: str | os.PathLike[str]) -> Record:
@@ -222,15 +236,21 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         )
     reference_point = _numbers(start["reference_point"], "reference_point", (None,))
     preferences = _numbers(start["preferences"], "preferences", (None, len(reference_point)))
-    shape = preferences.shape
-    floors, evaluations = [], []
+    general_policy = start["general_policy"] is True
+    shape = (len(preferences) if general_policy else None, len(reference_point))
+    floors: list[Floor] = []
+    evaluations: list[Evaluation] = []
     final_values: Array | None = None
     error: str | None = UNENDED
     for event in events[1:]:
+        if error != UNENDED or final_values is not None:
+            raise FileFormatError("it goes on after its end.")
         if event["event"] == "floor":
             floors.append(Floor(str(event["policy"]), _numbers(event["values"], "a floor's values", shape)))
         elif event["event"] == "evaluation":
             values = _numbers(event["values"], "an evaluation's values", shape)
+            if evaluations and event["steps"] <= evaluations[-1].steps:
+                raise FileFormatError(f"its evaluations go from {evaluations[-1].steps} steps to {event['steps']}.")
             evaluations.append(Evaluation(_whole(event["steps"], "steps"), _finite(event["seconds"], "seconds"), values))
         elif event["event"] == "end" and event["status"] == "finished":
             returns = _numbers(event["front"]["returns"], "the front's returns", (shape[0], None, shape[1]))
@@ -248,6 +268,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         config=dict(start["config"]),
         reference_point=reference_point,
         preferences=preferences,
+        general_policy=general_policy,
         parameters={str(name): _whole(n, "parameters") for name, n in dict(start["parameters"]).items()},
         start=start,
         floors=floors,

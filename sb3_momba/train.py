@@ -144,6 +144,7 @@ def description(
         "config": recorded_settings(settings),
         "reference_point": reference_point,
         "preferences": preferences,
+        "general_policy": True,
         "parameters": {
             "actor": sum(p.numel() for p in model.actor.parameters()),
             "critic": sum(p.numel() for p in model.critic.parameters()),

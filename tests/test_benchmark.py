@@ -69,7 +69,7 @@ def write_record(
     config = {**deepcopy(CONFIG), **(settings or {})}
     content = {"label": "a", "env": "E", "env_kwargs": {}, "seed": 0, "config": config, "reference_point": [0.0, 0.0]}
     writer = RecordWriter(path).start(
-        **{**content, "preferences": PREFERENCES, "parameters": {"actor": 10, "critic": 200}, **start}
+        **{**content, "preferences": PREFERENCES, "general_policy": True, "parameters": {"actor": 10, "critic": 200}, **start}
     )
     for policy, earned in floors.items():
         writer.append("floor", policy=policy, values=earned)

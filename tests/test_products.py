@@ -5,6 +5,8 @@ import torch as th
 
 from sb3_momba.nn.products import fast_float32_products, onednn_keeps_float32
 
+pytestmark = pytest.mark.skipif(not hasattr(th.backends.mkldnn, "matmul"), reason="torch before 2.9 has no such setting")
+
 
 @pytest.fixture(autouse=True)
 def fresh_probe():
@@ -47,6 +49,16 @@ def rounding_product(x: th.Tensor, y: th.Tensor) -> th.Tensor:
     if x.dtype == th.float32:
         x, y = x.bfloat16().float(), y.bfloat16().float()
     return th.matmul(x, y)
+
+
+def test_a_choice_of_the_user_stands():
+    settings = th.backends.mkldnn.matmul
+    before, settings.fp32_precision = settings.fp32_precision, "ieee"
+    try:
+        with fast_float32_products():
+            assert setting() == "ieee"
+    finally:
+        settings.fp32_precision = before
 
 
 def test_torch_without_the_setting_trains_as_ever(monkeypatch):

@@ -76,6 +76,7 @@ def writer_of(path: Path, **changed: Any) -> RecordWriter:
         "seed": 0,
         "config": {"hyperparameters": {"gamma": 0.99}},
         "reference_point": [0.0, 0.0],
+        "general_policy": True,
         "preferences": PREFERENCES,
         "parameters": {"actor": 10, "critic": 20},
     }
@@ -120,7 +121,9 @@ def valid(tmp_path) -> Path:
 def test_a_record_holds_what_its_format_promises(tiny_run) -> None:
     assert [line["event"] for line in tiny_run.lines] == ["start", "floor", "floor", "evaluation", "evaluation", "end"]
     start, *floors_and_curve, end = tiny_run.lines
-    named = "format version label env env_kwargs seed config reference_point preferences parameters versions machine"
+    named = (
+        "format version label env env_kwargs seed config reference_point preferences general_policy parameters versions machine"
+    )
     assert {*named.split(), "git_revision", "started"} <= set(start)
     assert (start["format"], start["version"]) == ("sb3_momba.record", 1)
     assert (start["label"], start["env"], start["env_kwargs"], start["seed"]) == ("tiny", ENV, {}, 3)
@@ -186,7 +189,7 @@ def test_seconds_are_of_training_and_evaluations_apart(tmp_path, monkeypatch) ->
 
 def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:
     config = tiny_run.lines[0]["config"]
-    assert set(config) == {field.name for field in fields(RunSettings)} - {"output", "progress_bar"}
+    assert set(config) == {field.name for field in fields(RunSettings)} - {"output", "progress_bar", "eval_workers"}
     assert (config["steps"], config["eval_freq"], config["n_episodes"], config["policy"]) == (120, 60, 2, "SimbaPolicy")
     written = config["hyperparameters"]
     arguments = inspect.signature(MOMBA.__init__).parameters
@@ -405,9 +408,7 @@ def test_each_line_is_on_disk_before_the_call_returns(tmp_path, monkeypatch) -> 
     assert lines_of(path)[-1]["status"] == "finished"
 
 
-@pytest.mark.parametrize(
-    "error", [RuntimeError("boom"), KeyboardInterrupt(), SystemExit(3), MemoryError("too large"), ValueError("two\nlines")]
-)
+@pytest.mark.parametrize("error", [RuntimeError("boom"), MemoryError("too large"), ValueError("two\nlines")])
 def test_an_error_inside_leaves_its_end(tmp_path, error: BaseException) -> None:
     path = tmp_path / "record.jsonl"
     with pytest.raises(type(error)) as raised, writer_of(path) as writer:  # noqa: PT012
@@ -487,7 +488,7 @@ def test_a_run_that_breaks_off_leaves_a_readable_record(tmp_path, monkeypatch, e
         run(settings)
     record = read_record(tmp_path / "run" / "record.jsonl")
     assert record.error is not None
-    assert type(error).__name__ in record.error
+    assert record.error == ("RuntimeError: diverged" if isinstance(error, Exception) else UNENDED)
     assert [floor.policy for floor in record.floors] == ["standing still", "random actions"]
     assert record.evaluations == []
 
@@ -503,7 +504,7 @@ def test_a_bound_that_is_infinite_is_a_setting_like_others(tmp_path, monkeypatch
     with pytest.raises(SystemExit) as stop:
         main([*line.split(), "--set", "buffer_size=100", "--env-kwargs", "healthy_z_range=[0.5, .inf]"])
     assert stop.value.code == 130, f"refused with {stop.value.code!r}; left {list((tmp_path / 'run').glob('*'))}"
-    start, *floors, _ = lines_of(tmp_path / "run" / "record.jsonl")
+    start, *floors = lines_of(tmp_path / "run" / "record.jsonl")
     assert "0.5" in json.dumps(start["env_kwargs"])
     assert len(floors) == 2
 

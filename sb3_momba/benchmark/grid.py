@@ -4,18 +4,22 @@ A cell whose run ended, well or badly, is not run again; one that was cut off is
 """
 
 import argparse
+import contextlib
+import fcntl
 import logging
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sb3_momba.records import FILE_NAME, UNENDED, read_record
-from sb3_momba.train import parse, recorded_settings
+from sb3_momba.envs.wrappers import make_env
+from sb3_momba.momba import parse_ent_coef
+from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
+from sb3_momba.train import RunSettings, parse, recorded_settings
 from sb3_momba.zoo.configuration import read_configuration
 
 logger = logging.getLogger(__name__)
@@ -38,9 +42,10 @@ class Cell:
     def name(self) -> str:
         return f"{Path(self.conf).stem}/{self.env}/{self.seed}"
 
-    def command(self, folder: Path) -> list[str]:
+    def arguments(self, folder: Path) -> list[str]:
+        """Of `python -m sb3_momba.train`."""
         where = ["--conf", self.conf, "--env", self.env, "--seed", str(self.seed), "--output", str(folder)]
-        return [sys.executable, "-m", "sb3_momba.train", *where, "--no-progress-bar", *self.options]
+        return [*self.options, *where, "--no-progress-bar"]
 
 
 def make_cells(
@@ -56,9 +61,9 @@ def make_cells(
         raise ValueError(f"seeds={seeds}: at least one is needed.")
     cells: dict[str, Cell] = {}
     for seed in range(seeds):
-        for env in envs:
-            for conf in confs:
-                learned = str(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto")).startswith("auto")
+        for env in dict.fromkeys(envs):
+            for conf in dict.fromkeys(confs):
+                learned, _ = parse_ent_coef(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto"))
                 start = ("--ent-coef", f"auto_{auto_ent_coef}") if auto_ent_coef is not None and learned else ()
                 cell = Cell(conf, env, seed, (*start, *options))
                 if cell.name in cells:
@@ -70,42 +75,62 @@ def make_cells(
 def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2) -> int:
     """Run what has not ended yet; the number of runs that failed, now or before.
 
-    :raises ValueError: for options that are not understood, and for a folder that holds something else, before anything runs
+    :raises ValueError: for a folder that holds something else, or where another grid runs, before anything runs
+    :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
-    waiting = [cell for cell in cells if has_to_run(cell, output / cell.name)]
-    with ThreadPoolExecutor(processes) as pool:
-        list(pool.map(lambda cell: _run_cell(cell, output / cell.name), waiting))
+    if processes < 1:
+        raise ValueError(f"processes={processes}: at least one is needed.")
+    settings = {cell.name: parse(cell.arguments(output / cell.name)) for cell in cells}
+    for env, env_kwargs in {one.env: one.env_kwargs for one in settings.values()}.items():
+        make_env(env, env_kwargs).close()
+    output.mkdir(parents=True, exist_ok=True)
+    with alone_in(output):
+        waiting = [cell for cell in cells if has_to_run(output / cell.name, settings[cell.name])]
+        with ThreadPoolExecutor(processes) as pool:
+            list(pool.map(lambda cell: _run_cell(cell, output / cell.name), waiting))
     return sum(outcome(output / cell.name) is not None for cell in cells)
 
 
-def has_to_run(cell: Cell, folder: Path) -> bool:
-    """Whether the cell never ran or was cut off.
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """:raises ValueError: if another process is in here with the same folder"""
+    with open(folder / ".lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"Another grid runs in {folder}: wait for it, or choose another --output.") from error
+        yield
 
-    :raises ValueError: if its folder holds anything but a run with the cell's settings
+
+def has_to_run(folder: Path, settings: RunSettings) -> bool:
+    """Whether a cell never ran or was cut off.
+
+    :raises ValueError: if its folder holds anything but a run with these settings
     """
-    settings = recorded_settings(parse(cell.command(folder)[3:]))
     record = folder / FILE_NAME
     if not record.exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ValueError(f"{folder} holds something else than a run: choose another --output.")
         return True
-    if cut_off_at_its_start(record):
+    if is_cut_off_at_its_start(record):
         return True
-    found = read_record(record)
-    if found.config != settings:
-        differing = sorted(name for name in {*settings, *found.config} if settings.get(name) != found.config.get(name))
+    found, wanted = read_record(record), recorded_settings(settings)
+    if found.config != wanted:
+        differing = sorted(name for name in {*wanted, *found.config} if wanted.get(name) != found.config.get(name))
         raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
     return found.error == UNENDED
 
 
 def _run_cell(cell: Cell, folder: Path) -> None:
     logger.info("%s starts", cell.name)
-    shutil.rmtree(folder, ignore_errors=True)  # What was cut off; see `has_to_run`.
+    if folder.exists():
+        shutil.rmtree(folder)  # What was cut off; see `has_to_run`.
     folder.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "sb3_momba.train", *cell.arguments(folder)]
     with open(log_of(folder), "wb") as log:
         # Runs side by side share the cores: one thread each.
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        subprocess.run(cell.command(folder), stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
+        subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
     error = outcome(folder)
     logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
 
@@ -113,15 +138,10 @@ def _run_cell(cell: Cell, folder: Path) -> None:
 def outcome(folder: Path) -> str | None:
     """Why a run failed; None for one that finished."""
     record = folder / FILE_NAME
-    if record.exists() and not cut_off_at_its_start(record):
+    if record.exists() and not is_cut_off_at_its_start(record):
         return read_record(record).error
     said = log_of(folder).read_text(errors="replace").strip() if log_of(folder).exists() else ""
     return f"it did not start: {said.splitlines()[-1] if said else 'no output'}"
-
-
-def cut_off_at_its_start(record: Path) -> bool:
-    """Whether not even the first line of a record was written to its end."""
-    return b"\n" not in record.read_bytes()
 
 
 def log_of(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 
 from sb3_momba.pareto.metrics import (
-    convex_coverage,
+    convex_envelope,
     expected_utility,
     hypervolume,
     inverted_generational_distance,
@@ -28,8 +28,8 @@ NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference
 class Run:
     """One run's scores.
 
-    A run that failed or did not end counts with the hypervolume 0 and the expected utility of the worse floor (of the worst
-    finished run where no floor is recorded); its regret and its distance are unknown.
+    A run that failed or did not end counts with the hypervolume 0 and with the expected utility and the distance of the worse
+    floor (unknown where no floor is recorded). Its regret is unknown: standing still regrets nothing.
 
     :param curve: hypervolume at each of `steps`
     """
@@ -40,7 +40,6 @@ class Run:
     preference_regret: float
     inverted_generational_distance: float
     steps: Array
-    seconds: Array
     curve: Array
 
     @property
@@ -53,14 +52,14 @@ class Task:
     """All that was run on one task.
 
     :param methods: runs by the method's name
-    :param floors: name, hypervolume and expected utility of policies that learned nothing
-    :param reference_front: the convex envelope of all solutions of all methods (section 4.4), (n, n_objectives)
+    :param floors: hypervolume, expected utility and distance of policies that learned nothing, by name
+    :param reference_front: the convex envelope of the final solutions of all methods (section 4.4), (n, n_objectives)
     """
 
     name: str
     reference_point: Array
     reference_front: Array
-    floors: dict[str, tuple[float, float]]
+    floors: dict[str, tuple[float, float, float]]
     methods: dict[str, list[Run]]
 
 
@@ -77,58 +76,78 @@ def compare(records: Iterable[Record], reference_point: ArrayLike | None = None)
 
 
 def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLike | None) -> Task:
+    reference = _reference_point(name, records, reference_point)
+    _check_protocol(name, records)
+    final = [record.final_values for record in records if record.final_values is not None]
+    front = convex_envelope(np.concatenate(final)) if final else np.zeros((0, len(reference)))
+    preferences = records[0].preferences
+    # The floors do not depend on the method; a run that was cut off may lack one.
+    floors = {
+        floor.policy: (
+            hypervolume(floor.values, reference),
+            expected_utility(floor.values, preferences),
+            normalized_distance(floor.values, front),
+        )
+        for floor in max(records, key=lambda record: len(record.floors)).floors
+    }
+    methods = {
+        method: [_score(record, reference, front, list(floors.values())) for record in its_records]
+        for method, its_records in name_methods(records).items()
+    }
+    return Task(name, reference, front, floors, methods)
+
+
+def _reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
     points = sorted({tuple(record.reference_point.tolist()) for record in records})
-    if reference_point is None and len(points) > 1:
+    if given is None and len(points) > 1:
         raise ValueError(f"The records of {name} have the reference points {points}: choose one, --reference-point.")
-    reference = records[0].reference_point if reference_point is None else np.asarray(reference_point, dtype=np.float64)
+    reference = records[0].reference_point if given is None else np.asarray(given, dtype=np.float64)
     for record in records:
         if record.preferences.shape[1] != len(reference):
             raise ValueError(
                 f"{name} has {record.preferences.shape[1]} objectives in {record.path}, the reference point "
-                f"{reference.tolist()} has {len(reference)} numbers."
+                f"{reference.tolist()} has {len(reference)} numbers: report tasks of other numbers of objectives apart."
             )
-    finals = [(record.final_values, record.preferences) for record in records if record.final_values is not None]
-    front = np.zeros((0, len(reference)))
-    if finals:
-        values, preferences = (np.concatenate(parts) for parts in zip(*finals, strict=True))
-        front = convex_coverage(values, np.unique(preferences, axis=0))
-    floors = _floors(records, reference)
-    utilities = [expected_utility(values, preferences) for values, preferences in finals]
-    worst_utility = min([utility for _, utility in floors.values()] or utilities, default=0.0)
-    methods: dict[str, list[Run]] = {}
-    for method, its_records in name_methods(records).items():
-        methods[method] = [_score(record, reference, front, worst_utility) for record in its_records]
-    return Task(name, reference, front, floors, methods)
+    return reference
 
 
-def _floors(records: Sequence[Record], reference_point: Array) -> dict[str, tuple[float, float]]:
-    """Hypervolume and expected utility, of a record that has all of them: they do not depend on the method."""
-    record = max(records, key=lambda record: len(record.floors))
-    return {
-        floor.policy: (hypervolume(floor.values, reference_point), expected_utility(floor.values, record.preferences))
-        for floor in record.floors
-    }
+def _check_protocol(name: str, records: Sequence[Record]) -> None:
+    """Hypervolume and expected utility grow with the number of preferences and episodes."""
+    first = records[0]
+    for record in records[1:]:
+        same = np.array_equal(record.preferences, first.preferences)
+        if not same or record.config.get("n_episodes") != first.config.get("n_episodes"):
+            found = [f"{len(r.preferences)} x {r.config.get('n_episodes')} ({r.path})" for r in (first, record)]
+            raise ValueError(
+                f"{name} was evaluated with different preferences or episodes, {' and '.join(found)}: report them apart."
+            )
 
 
-def _score(record: Record, reference_point: Array, front: Array, worst_utility: float) -> Run:
+def _score(record: Record, reference_point: Array, front: Array, floors: Sequence[tuple[float, float, float]]) -> Run:
     steps = np.array([evaluation.steps for evaluation in record.evaluations], dtype=np.float64)
-    seconds = np.array([evaluation.seconds for evaluation in record.evaluations])
     curve = np.array([hypervolume(evaluation.values, reference_point) for evaluation in record.evaluations])
     values = record.final_values
     if values is None:
-        return Run(record, 0.0, worst_utility, np.nan, np.nan, steps, seconds, curve)
-    nadir, span = front.min(axis=0), np.ptp(front, axis=0)
-    span = np.where(span > 0, span, 1.0)
+        utility = min((utility for _, utility, _ in floors), default=np.nan)
+        distance = max((distance for _, _, distance in floors), default=np.nan)
+        return Run(record, 0.0, utility, np.nan, distance, steps, curve)
     return Run(
         record,
         hypervolume(values, reference_point),
         expected_utility(values, record.preferences),
-        preference_regret(values, record.preferences),
-        inverted_generational_distance((values - nadir) / span, (front - nadir) / span),
+        preference_regret(values, record.preferences) if record.general_policy else np.nan,
+        normalized_distance(values, front),
         steps,
-        seconds,
         curve,
     )
+
+
+def normalized_distance(values: Array, front: Array) -> float:
+    """IGD (4.3) on axes on which the front's range is [0, 1]; unknown where it has none."""
+    if len(front) < 2:
+        return np.nan
+    nadir, span = front.min(axis=0), np.ptp(front, axis=0)
+    return inverted_generational_distance((values - nadir) / span, (front - nadir) / span)
 
 
 def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
@@ -159,7 +178,7 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _as_text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 def curve_on(runs: Sequence[Run]) -> tuple[Array, Array]:
@@ -176,8 +195,8 @@ def curve_on(runs: Sequence[Run]) -> tuple[Array, Array]:
 
 
 def areas_under_curve(runs: Sequence[Run]) -> list[float]:
-    """For each run its mean hypervolume from the method's first evaluation to its last."""
+    """For each run its mean hypervolume from the method's first evaluation to its last; unknown if that is one."""
     steps, curves = curve_on(runs)
     if len(steps) < 2:
-        return [run.hypervolume for run in runs]
+        return [np.nan] * len(runs)
     return [float(area) for area in trapezoid(curves, steps, axis=1) / (steps[-1] - steps[0])]

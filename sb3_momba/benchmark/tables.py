@@ -16,5 +16,7 @@ def one_line(text: str) -> str:
 
 
 def as_text(estimate: Estimate) -> str:
-    """value [low, high]."""
+    """value [low, high]; of a single run the value alone."""
+    if not estimate.low < estimate.high:
+        return f"{estimate.value:,.4g}"
     return f"{estimate.value:,.4g} [{estimate.low:,.4g}, {estimate.high:,.4g}]"

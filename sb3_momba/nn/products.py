@@ -7,6 +7,8 @@ from typing import Any
 
 import torch as th
 
+UNDECIDED = "none"
+
 
 @contextlib.contextmanager
 def fast_float32_products() -> Iterator[None]:
@@ -14,9 +16,10 @@ def fast_float32_products() -> Iterator[None]:
 
     torch gives them to MKL, which uses half the width of an AMD processor. The permission to round factors to bfloat16 hands
     them to oneDNN, which makes use of it only where there are instructions for that (AMX); elsewhere its products are float32
-    and up to twice as fast. Where a probe shows rounded factors, nothing is changed.
+    and up to twice as fast. Where a probe shows rounded factors, or the user has decided, nothing is changed. The setting
+    is the process's: products of other threads are meant too, meanwhile.
     """
-    if not onednn_keeps_float32():
+    if not onednn_keeps_float32() or _settings().fp32_precision != UNDECIDED:
         yield
         return
     with _rounding_permitted():
@@ -28,7 +31,7 @@ def onednn_keeps_float32() -> bool:
     """Whether a permitted rounding is not made use of: the probe's error is 1e-6 in float32, 6e-2 with rounded factors."""
     if not hasattr(getattr(th.backends.mkldnn, "matmul", None), "fp32_precision"):
         return False  # torch before 2.9
-    x = th.sin(th.arange(256.0 * 256.0)).reshape(256, 256)
+    x = th.sin(th.arange(256.0 * 256.0, dtype=th.float32, device="cpu")).reshape(256, 256)
     exact = x.double() @ x.double()
     with _rounding_permitted():
         error = (x @ x - exact).abs().max() / exact.abs().max()
@@ -37,10 +40,13 @@ def onednn_keeps_float32() -> bool:
 
 @contextlib.contextmanager
 def _rounding_permitted() -> Iterator[None]:
-    settings: Any = th.backends.mkldnn.matmul  # type: ignore[attr-defined]
-    before = settings.fp32_precision
-    settings.fp32_precision = "bf16"
+    before = _settings().fp32_precision
+    _settings().fp32_precision = "bf16"
     try:
         yield
     finally:
-        settings.fp32_precision = before
+        _settings().fp32_precision = before
+
+
+def _settings() -> Any:
+    return th.backends.mkldnn.matmul  # type: ignore[attr-defined]

@@ -19,6 +19,7 @@ from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_front, probe_environment
 from sb3_momba.pareto.metrics import hypervolume
 from sb3_momba.pareto.plotting import plot_front
+from sb3_momba.pareto.protocol import N_EPISODES, N_PREFERENCES
 from sb3_momba.records import RecordWriter
 
 logger = logging.getLogger(__name__)
@@ -46,8 +47,8 @@ class ParetoEvalCallback(EventCallback):
         self,
         eval_env: str | gym.Env | VecEnv | Callable[[], gym.Env],
         eval_freq: int = 50_000,
-        n_preferences: int = 100,
-        n_episodes: int = 5,
+        n_preferences: int = N_PREFERENCES,
+        n_episodes: int = N_EPISODES,
         seed: int = 0,
         reference_point: ArrayLike | None = None,
         deterministic: bool = True,
@@ -193,7 +194,7 @@ class RecordCallback(BaseCallback):
         self.record = record
 
     def _on_training_start(self) -> None:
-        self.started = time.perf_counter()
+        self.started = time.perf_counter() - self.parent.evaluation_seconds
 
     def _on_step(self) -> bool:
         evaluating = self.parent.evaluation_seconds

@@ -19,6 +19,7 @@ from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.files import FileFormatError, FilePath, read_tree, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.pareto import metrics
+from sb3_momba.pareto.protocol import N_EPISODES, N_PREFERENCES
 
 MAX_PARALLEL_EPISODES = BATCH = 128
 FRONT_FORMAT = "sb3_momba.front"
@@ -98,8 +99,8 @@ class ParetoFront:
 def evaluate_front(
     model: Predictor,
     env: str | gym.Env | VecEnv | Callable[[], gym.Env],
-    n_preferences: int = 100,
-    n_episodes: int = 5,
+    n_preferences: int = N_PREFERENCES,
+    n_episodes: int = N_EPISODES,
     seed: int = 0,
     preferences: ArrayLike | None = None,
     gamma: float | None = None,

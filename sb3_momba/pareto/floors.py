@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front, probe_environment
+from sb3_momba.pareto.protocol import N_EPISODES
 
 MEASURED = ("returns", "discounted_returns", "episode_lengths")
 
@@ -39,7 +40,7 @@ class RandomPolicy:
 
 
 def evaluate_floors(
-    env: str | gym.Env | VecEnv | Callable[[], gym.Env], preferences: np.ndarray, n_episodes: int = 5, seed: int = 0
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env], preferences: np.ndarray, n_episodes: int = N_EPISODES, seed: int = 0
 ) -> dict[str, ParetoFront]:
     """Both, under the protocol of a learned policy.
 

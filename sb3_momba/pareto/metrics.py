@@ -6,6 +6,7 @@ Shapes: `values` is (n_solutions, n_objectives), `preferences` is (n_preferences
 import moocore
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linprog
 
 Array = NDArray[np.float64]
 
@@ -81,13 +82,35 @@ def non_dominated(values: ArrayLike) -> NDArray[np.bool_]:
     return np.asarray(moocore.is_nondominated(points, maximise=True, keep_weakly=False), dtype=bool)
 
 
-def convex_coverage(values: ArrayLike, preferences: ArrayLike) -> Array:
-    """The values that are the best for some preference: the convex envelope of section 4.4, each point once.
+def convex_envelope(values: ArrayLike) -> Array:
+    """The values that some preference likes best, each one once: the convex envelope of section 4.4.
+
+    For each value v a linear programme looks for the preference w that puts it furthest ahead: max t with w.(v - u) >= t for
+    all others u; v belongs to the envelope if t is not negative.
 
     :return: (n, n_objectives)
     """
-    points = as_points(values, at_least=1)
-    return np.unique(points[_utilities(points, preferences).argmax(axis=1)], axis=0)
+    points = np.unique(as_points(values, at_least=1), axis=0)
+    points = points[non_dominated(points)]
+    span = np.ptp(points, axis=0)
+    scaled = (points - points.min(axis=0)) / np.where(span > 0, span, 1)
+    return points[[_largest_lead(v - np.delete(scaled, i, axis=0)) > -1e-9 for i, v in enumerate(scaled)]]
+
+
+def _largest_lead(leads: Array) -> float:
+    """max over preferences w of min_i w.leads_i, (n, n_objectives) -> t; infinite where there is no other."""
+    n, n_objectives = leads.shape
+    if n == 0:
+        return np.inf
+    found = linprog(
+        c=[*[0.0] * n_objectives, -1.0],
+        A_ub=np.hstack([-leads, np.ones((n, 1))]),
+        b_ub=np.zeros(n),
+        A_eq=[[*[1.0] * n_objectives, 0.0]],
+        b_eq=[1.0],
+        bounds=[*[(0, 1)] * n_objectives, (None, None)],
+    )
+    return float(-found.fun)
 
 
 def summarise(values: ArrayLike, preferences: ArrayLike, reference_point: ArrayLike) -> dict[str, float]:

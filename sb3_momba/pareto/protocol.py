@@ -5,7 +5,7 @@ from collections.abc import Sequence
 N_PREFERENCES = 100
 N_EPISODES = 5
 
-# Of the hypervolume. A task whose returns fall below 0 needs a point of its own here before its results can be compared.
+# Of the hypervolume. A task whose good returns lie below 0 needs a point of its own here before results can be compared.
 REFERENCE_POINTS = {
     "MO-Ant-v4": (0.0, 0.0),
     "MO-HalfCheetah-v4": (0.0, 0.0),
