@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint known-fronts first-records clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -17,6 +17,15 @@ lint: $(VENV)/tools
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The evidence of docs/results.md, too slow for every test: an hour and more on two cores.
+known-fronts: $(VENV)/tools
+	$(ONE_THREAD) $(BIN)/python -m tests.known_fronts
+
+first-records: $(VENV)/installed
+	$(BIN)/python -m sb3_momba.benchmark run --conf momba capql capql_uniform --env MO-HalfCheetah-v4 MO-Hopper-v4 \
+		--seeds 2 --steps 3e4 --eval-freq 5e3 --auto-ent-coef 0.01 --output runs/first
+	$(BIN)/python -m sb3_momba.benchmark report runs/first
 
 $(VENV)/installed: setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -206,8 +206,11 @@ def test_standing_still_is_no_solution():
         assert score(front.discounted_returns.mean(axis=1), exact_front_of(task_name))[0] < task.share - 0.2
 
 
-def test_a_short_training_comes_near_the_exact_front():
-    share, distance = train_and_score("bandit, 2 objectives", 2_000, 1, "SimbaPolicy", "ce", False)
-    # Seeds 0, 1, 2 reach 0.98 to 0.99 and 0.09 to 0.04; random actions 0.82 and 0.12, the best constant one 0.69 and 0.39.
-    assert share >= 0.95
-    assert distance <= 0.11
+# Three seeds of each reach 0.94 to 1.00 and 0.05 to 0.01; random actions 0.82 and 0.12, the best constant one 0.69 and 0.39.
+@pytest.mark.parametrize("vector_values", [False, True], ids=["scalarised", "vector"])
+@pytest.mark.parametrize("critic_loss", ["ce", "mse"])
+@pytest.mark.parametrize("policy", ["SimbaPolicy", "MlpPolicy"])
+def test_a_short_training_comes_near_the_exact_front(policy, critic_loss, vector_values):
+    share, distance = train_and_score("bandit, 2 objectives", 1_500, 1, policy, critic_loss, vector_values)
+    assert share >= 0.92
+    assert distance <= 0.08
