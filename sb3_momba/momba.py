@@ -1,5 +1,6 @@
 """MOMBA: preference-conditioned maximum-entropy actor-critic with SimbaV2 networks and distributional critics."""
 
+import contextlib
 import logging
 from typing import Any, ClassVar, TypeVar
 
@@ -18,7 +19,7 @@ from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
-from sb3_momba.nn.products import fast_float32_products
+from sb3_momba.nn.products import PRECISIONS, fast_float32_products, product_dtype
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 
 MAX_SKIPPED_UPDATES = 20
@@ -27,6 +28,7 @@ CHOICES = {
     "critic_loss": ("ce", "mse"),
     "critic_minimum": ("scalarised", "objective"),
     "critic_loss_reduction": ("sum", "mean"),
+    "precision": PRECISIONS,
 }
 
 Self = TypeVar("Self", bound="MOMBA")
@@ -62,6 +64,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param target_entropy: of the policy on [-1, 1], in nats; "auto": -|A|
     :param preference_sampler: `rng -> (n_objectives,)` for all environments; None leaves them theirs, by default uniform
         on the simplex once an episode; or a literal as `make_sampler` takes it
+    :param precision: of the factors of matrix products in an update: "float32", "bfloat16", or "auto", bfloat16 where the
+        device has instructions for it
     :param critic_minimum: "scalarised": the critic whose w.Q is lower (section 3.4.2); "objective": the lower Q of each
         objective apart (CAPQL)
     :param critic_loss_reduction: over critics and objectives: "sum" (3.17) or "mean" (CAPQL)
@@ -100,6 +104,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         ent_coef: str | float = "auto_0.2",
         target_entropy: str | float = "auto",
         preference_sampler: PreferenceSampler | SamplerSpec | None = None,
+        precision: str = "float32",
         critic_minimum: str = "scalarised",
         critic_loss_reduction: str = "sum",
         deterministic_exploration: bool = False,
@@ -147,6 +152,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self.her = her
         self.her_kwargs = her_kwargs
         self.preference_alignment = preference_alignment
+        self.precision = precision
         self.critic_minimum = critic_minimum
         self.critic_loss_reduction = critic_loss_reduction
         self.deterministic_exploration = deterministic_exploration
@@ -295,10 +301,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
     def _gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
         """One pass through the inner loop of Algorithm 1."""
         alpha = self.alpha
-        critic_loss, critic_metrics = self._critic_loss(batch, alpha)
+        with self._rounded_products():
+            critic_loss, critic_metrics = self._critic_loss(batch, alpha)
         descend(self.critic.optimizer, critic_loss)
         try:
-            actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
+            with self._rounded_products():
+                actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
             descend(self.actor.optimizer, actor_loss)
             if self.ent_coef_optimizer is not None:
                 descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
@@ -307,6 +315,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
             move_towards(self.critic_target, self.critic, self.tau)
         self._n_updates += 1
         self._metrics.add({**critic_metrics, **actor_metrics, "ent_coef": alpha})
+
+    def _rounded_products(self) -> contextlib.AbstractContextManager[None]:
+        """Inside, the factors of matrix products are rounded as `precision` says. One context for each loss: it keeps the
+        rounded weights."""
+        dtype = product_dtype(self.precision, self.device)
+        return th.autocast(self.device.type, dtype, enabled=dtype != th.float32)  # type: ignore[return-value]
 
     def _skip_update(self, error: "NonFiniteLossError") -> None:
         """Go on after a bad loss; give up after many in a row, each network as its last good step left it."""

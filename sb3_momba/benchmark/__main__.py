@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import gymnasium as gym
 
-from sb3_momba.benchmark import floors, grid, report
+from sb3_momba.benchmark import floors, grid, report, speed
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -16,6 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     grid.add_arguments(commands.add_parser("run", help="train a grid of runs", allow_abbrev=False))
     report.add_arguments(commands.add_parser("report", help="compare records", allow_abbrev=False))
     floors.add_arguments(commands.add_parser("floors", help="measure policies that learned nothing", allow_abbrev=False))
+    speed.add_arguments(commands.add_parser("speed", help="measure speed on this machine", allow_abbrev=False))
     given, rest = parser.parse_known_args(arguments)
     try:
         if given.command == "run":
@@ -24,8 +25,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             parser.error(f"unrecognized arguments: {' '.join(rest)}")
         elif given.command == "report":
             report.main(given)
-        else:
+        elif given.command == "floors":
             floors.main(given)
+        else:
+            speed.main(given)
     except (ValueError, OSError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
 

@@ -19,7 +19,8 @@ def expectation(probabilities: th.Tensor, support: th.Tensor) -> th.Tensor:
     :param support: (n_atoms,)
     :return: (...)
     """
-    return probabilities @ support
+    # No matrix product: those may be rounded to bfloat16.
+    return (probabilities * support).sum(dim=-1)
 
 
 def project(probabilities: th.Tensor, atoms: th.Tensor, support: th.Tensor) -> th.Tensor:

@@ -1,13 +1,39 @@
-"""Float32 matrix products on processors where torch's default library is slow."""
+"""How matrix products are computed: in bfloat16 where that is asked for, and in float32 by the faster library."""
 
 import contextlib
+import logging
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import torch as th
 
+PRECISIONS = ("float32", "bfloat16", "auto")
 UNDECIDED = "none"
+
+logger = logging.getLogger(__name__)
+
+
+@cache  # and so said once
+def product_dtype(precision: str, device: th.device) -> th.dtype:
+    """What the factors of matrix products are rounded to; weights, norms, losses and sums stay float32 in any case.
+
+    :param precision: "float32", "bfloat16", or "auto": bfloat16 where the device has instructions for it (AMX, AVX512-BF16,
+        CUDA from Ampere on)
+    """
+    if precision == "auto":
+        native = has_native_bfloat16(device)
+        if not native:
+            logger.info("precision='auto': %s has no bfloat16 of its own, float32 is used.", device)
+        return th.bfloat16 if native else th.float32
+    return th.bfloat16 if precision == "bfloat16" else th.float32
+
+
+def has_native_bfloat16(device: th.device) -> bool:
+    if device.type == "cuda":  # untested
+        return th.cuda.is_bf16_supported(including_emulation=False)
+    checks = (getattr(th.cpu, name, None) for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"))
+    return device.type == "cpu" and any(check() for check in checks if check is not None)
 
 
 @contextlib.contextmanager
