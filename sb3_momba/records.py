@@ -65,7 +65,12 @@ class RecordWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # Held until the end: whoever deletes the record does not find lines of this run in the next one.
         self.file = open(self.path, "ab", buffering=0, opener=_only_new)  # noqa: SIM115
-        self._write(line)
+        try:
+            self._write(line)
+        except BaseException:
+            self.file.close()
+            self.path.unlink()
+            raise
         return self
 
     def append(self, event: str, **content: Any) -> None:
@@ -236,7 +241,9 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         )
     reference_point = _numbers(start["reference_point"], "reference_point", (None,))
     preferences = _numbers(start["preferences"], "preferences", (None, len(reference_point)))
-    general_policy = start["general_policy"] is True
+    general_policy = start["general_policy"]
+    if not isinstance(general_policy, bool):
+        raise FileFormatError(f"general_policy is {general_policy!r}, neither true nor false.")
     shape = (len(preferences) if general_policy else None, len(reference_point))
     floors: list[Floor] = []
     evaluations: list[Evaluation] = []

@@ -259,7 +259,10 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
 
 def whole_number(text: str) -> int:
     """An integer that may be written 1e6."""
-    return int(float(text))
+    try:
+        return int(float(text))
+    except OverflowError as error:
+        raise ValueError(f"{text} is no whole number") from error
 
 
 def first_given(*values: int | None) -> int:
@@ -275,13 +278,15 @@ def assign(values: dict[str, Any], assignment: str, option: str = "--set") -> No
     *parents, key = name.split(".")
     for parent in parents:
         values = values.setdefault(parent, {})
+        if not isinstance(values, dict):
+            raise ValueError(f"{option} {assignment}: {parent} is {values!r}, which has no {key!r} inside.")
     values[key] = literal(yaml.safe_load(text))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     try:
         result = run(parse(arguments))
-    except (ValueError, MemoryError, gym.error.Error) as error:
+    except (ValueError, MemoryError, ImportError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         print("\nInterrupted: the run's folder holds the model as it was.", file=sys.stderr)

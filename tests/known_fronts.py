@@ -122,7 +122,7 @@ class Task:
 TASKS = {
     "bandit, 2 objectives": Task(QuadraticBandit, 2, 1, 5_000, 0.98),
     "bandit, 3 objectives": Task(lambda: QuadraticBandit(3), 3, 1, 10_000, 0.98),
-    "LQR": Task(LinearQuadraticRegulator, 2, 4, 6_000, 0.95),
+    "LQR": Task(LinearQuadraticRegulator, 2, 4, 10_000, 0.95),
 }
 
 

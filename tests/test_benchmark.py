@@ -8,22 +8,28 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial import ConvexHull
 
 from sb3_momba import records, train
 from sb3_momba.benchmark import grid
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.grid import Cell, make_cells, run_grid
+from sb3_momba.benchmark.grid import Cell, alone_in, has_to_run, make_cells, run_grid
 from sb3_momba.benchmark.report import median_run, write_report
 from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
+from sb3_momba.benchmark.statistics import Estimate
+from sb3_momba.benchmark.tables import as_text
 from sb3_momba.files import FileFormatError
-from sb3_momba.records import Record, RecordWriter, read_record
+from sb3_momba.pareto.metrics import convex_envelope, non_dominated
+from sb3_momba.records import UNENDED, Record, RecordWriter, read_record
 from tests.stubs import TINY_SIMBA
 
 ENV = "mo-hopper-2obj-v5"
@@ -61,7 +67,7 @@ def write_record(
 ) -> Record:
     """A record of small numbers.
 
-    :param values: of the final front, one for each preference; None: the run does not finish
+    :param values: of the final front, with a general policy one for each preference; None: the run does not finish
     :param curve: steps and the values there
     :param error: that it fails with; "cut off": it has no end
     :param settings: added to the configuration
@@ -81,6 +87,7 @@ def write_record(
     elif isinstance(error, BaseException):
         with pytest.raises(type(error)), writer:
             raise error
+    writer.file.close()
     return read_record(path)
 
 
@@ -91,6 +98,9 @@ def box(volume: float) -> list[list[float]]:
 
 BAD = RuntimeError("diverged")
 FRONT = [[1.0, 3.0], [2.0, 2.0], [3.0, 1.0]]  # hypervolume 6 above 0
+# From FRONT to the floors, on axes on which FRONT goes from 0 to 1 and the floors are (0, 0) and (-1/4, -1/4).
+STILL_DISTANCE = (1 + np.sqrt(0.5) + 1) / 3
+RANDOM_DISTANCE = (2 * np.hypot(0.25, 1.25) + np.hypot(0.75, 0.75)) / 3
 
 
 def only(tasks: Sequence[Task]) -> Task:
@@ -190,8 +200,9 @@ def test_scores_by_hand(fake) -> None:
     assert run.preference_regret == 0
     assert run.inverted_generational_distance == 0
     np.testing.assert_array_equal(run.steps, [10, 20])
-    np.testing.assert_array_equal(run.seconds, [1, 2])
     np.testing.assert_array_equal(run.curve, [2, 6])
+    assert [evaluation.seconds for evaluation in run.record.evaluations] == [1, 2]
+    assert not hasattr(run, "seconds")
 
 
 def test_regret_is_what_the_answer_to_another_preference_would_have_been_worth(fake) -> None:
@@ -200,20 +211,68 @@ def test_regret_is_what_the_answer_to_another_preference_would_have_been_worth(f
     assert run.expected_utility == pytest.approx(8 / 3)
 
 
+def test_a_set_of_solutions_by_hand(fake) -> None:
+    """As many as there happen to be; which one answers which preference is not said, so that regret is unknown."""
+    floors = {name: values[:2] for name, values in FLOORS.items()}
+    curve = {10: [[2.0, 1.0]], 20: [[1.0, 3.0], [3.0, 1.0]] * 3}
+    made = [
+        fake([[3.0, 1.0], [1.0, 3.0]], curve, floors=floors, general_policy=False),
+        fake([*FRONT, [0.0, 0.0], [1.0, 1.0]], floors=floors, general_policy=False, label="b"),
+        fake(FRONT, label="c"),
+        fake(FRONT, general_policy=False, label="d"),
+    ]
+    task = only(compare(made))
+    two, five, general, as_many = (runs[0] for runs in task.methods.values())
+    assert (two.hypervolume, two.expected_utility) == (5, pytest.approx(8 / 3))
+    assert two.inverted_generational_distance == pytest.approx(np.sqrt(0.5) / 3)
+    np.testing.assert_array_equal(two.curve, [2, 5])
+    assert (five.hypervolume, five.expected_utility) == (6, pytest.approx(8 / 3))
+    assert five.inverted_generational_distance == 0
+    assert np.isnan([run.preference_regret for run in (two, five, as_many)]).all()
+    assert general.preference_regret == 0
+    np.testing.assert_array_equal(task.reference_front, FRONT)
+    assert task.floors["standing still"] == pytest.approx((1.0, 1.0, STILL_DISTANCE))
+
+
 def test_floors_by_hand(fake) -> None:
     floors = only(compare([fake(None, error=BAD, floors={}), fake(FRONT)])).floors
-    assert floors == {"standing still": (1.0, 1.0), "random actions": (0.25, 0.5)}
+    assert floors == {
+        "standing still": pytest.approx((1.0, 1.0, STILL_DISTANCE)),
+        "random actions": pytest.approx((0.25, 0.5, RANDOM_DISTANCE)),
+    }
 
 
+@pytest.mark.parametrize("general_policy", [True, False])
 @pytest.mark.parametrize("error", [BAD, "cut off"], ids=["failed", "cut off"])
-def test_a_run_that_did_not_finish_counts_with_nothing(fake, error: Any) -> None:
-    task = only(compare([fake(FRONT, seed=0), fake(None, {10: box(9.0)}, error, seed=1)]))
-    _, failed = task.methods["a"]
+def test_a_run_that_did_not_finish_counts_with_nothing(fake, error: Any, general_policy: bool) -> None:
+    made = [fake(FRONT, seed=0), fake(None, {10: box(9.0)}, error, seed=1, general_policy=general_policy)]
+    _, failed = only(compare(made)).methods["a"]
     assert not failed.is_finished
     assert (failed.hypervolume, failed.expected_utility) == (0.0, 0.5)
     assert np.isnan(failed.preference_regret)
-    assert np.isnan(failed.inverted_generational_distance)
+    assert failed.inverted_generational_distance == pytest.approx(RANDOM_DISTANCE)
     np.testing.assert_array_equal(failed.curve, [9])
+
+
+def test_the_worse_floor_is_that_of_each_score(fake) -> None:
+    """One has the lower utility, the other lies further from the front: on [0, 1] axes they are (0.2, 0.2) and (1, 0)."""
+    floors = {"standing still": [[1.4, 1.4]] * 3, "random actions": [[3.0, 1.0]] * 3}
+    distances = (2 * np.hypot(0.2, 0.8) + np.hypot(0.3, 0.3)) / 3, (np.sqrt(2) + np.sqrt(0.5) + 0) / 3
+    assert distances[0] < distances[1]
+    task = only(compare([fake(FRONT, floors=floors), fake(None, error=BAD, floors=floors, seed=1)]))
+    assert task.floors["standing still"][1:] == pytest.approx((1.4, distances[0]))
+    assert task.floors["random actions"][1:] == pytest.approx((2.0, distances[1]))
+    failed = task.methods["a"][1]
+    assert (failed.expected_utility, failed.inverted_generational_distance) == pytest.approx((1.4, distances[1]))
+
+
+@pytest.mark.parametrize("error", [BAD, "cut off"], ids=["failed", "cut off"])
+def test_without_floors_the_utility_and_the_distance_of_a_run_that_failed_are_unknown(fake, error: Any) -> None:
+    task = only(compare([fake(FRONT, floors={}), fake(None, {10: FRONT}, error, floors={}, seed=1)]))
+    assert task.floors == {}
+    failed = task.methods["a"][1]
+    assert failed.hypervolume == 0
+    assert np.isnan([failed.expected_utility, failed.inverted_generational_distance, failed.preference_regret]).all()
 
 
 def test_the_worse_floor_is_that_of_a_record_that_has_both(fake) -> None:
@@ -222,6 +281,7 @@ def test_the_worse_floor_is_that_of_a_record_that_has_both(fake) -> None:
     task = only(compare([fake(None, error="cut off", floors=still), fake(FRONT, seed=1)]))
     assert set(task.floors) == set(FLOORS)
     assert task.methods["a"][0].expected_utility == 0.5
+    assert task.methods["a"][0].inverted_generational_distance == pytest.approx(RANDOM_DISTANCE)
 
 
 def test_the_reference_point_is_the_records_or_the_given_one(fake) -> None:
@@ -232,7 +292,7 @@ def test_the_reference_point_is_the_records_or_the_given_one(fake) -> None:
     assert only_run(task).hypervolume == 2 * 1 + 1 * 1
     np.testing.assert_array_equal(task.reference_point, [1, 0])
     np.testing.assert_array_equal(only_run(task).curve, [3])
-    assert task.floors["standing still"] == (0.0, 1.0)
+    assert task.floors["standing still"] == pytest.approx((0.0, 1.0, STILL_DISTANCE))
 
 
 def test_reference_points_that_differ_are_an_error(fake) -> None:
@@ -246,15 +306,42 @@ def test_reference_points_that_differ_are_an_error(fake) -> None:
 
 @pytest.mark.parametrize("point", [[0.0], [0.0, 0.0, 0.0]], ids=str)
 def test_a_reference_point_of_another_length_is_an_error(fake, point: list[float]) -> None:
+    record = fake(FRONT)
     with pytest.raises(ValueError, match="2 objectives") as error:
-        compare([fake(FRONT)], point)
-    assert str(point) in str(error.value)
+        compare([record], point)
+    for part in (str(point), str(record.path), "report tasks of other numbers of objectives apart."):
+        assert part in str(error.value)
 
 
 def test_tasks_of_different_numbers_of_objectives_are_an_error(fake) -> None:
     three = {"reference_point": [0.0] * 3, "preferences": [[1.0, 0.0, 0.0]], "floors": {}}
     with pytest.raises(ValueError, match="E"):
         compare([fake(FRONT), fake([[1.0, 1.0, 1.0]], **three)])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"preferences": [[0.0, 1.0], [0.4, 0.6], [1.0, 0.0]]},
+        {"preferences": PREFERENCES[::-1]},
+        {"preferences": PREFERENCES[:2], "values": FRONT[:2], "floors": {}},
+        {"preferences": PREFERENCES[:2], "general_policy": False},
+        {"settings": {"n_episodes": 2}},
+        {"preferences": PREFERENCES[:2], "values": None, "error": "cut off", "floors": {}},
+    ],
+    ids=["other numbers", "another order", "fewer", "fewer, of a set", "other episodes", "of a run without an end"],
+)
+def test_records_of_one_task_that_were_evaluated_differently_are_an_error(fake, other: dict[str, Any]) -> None:
+    """Hypervolume and expected utility grow with preferences and episodes."""
+    same = {"settings": {"n_episodes": 5}}
+    made = [fake(FRONT, **same), fake(FRONT, **same, seed=1), fake(**{"values": FRONT, "label": "b", **same, **other})]
+    assert len(compare(made[:2])) == 1
+    with pytest.raises(ValueError, match="report them apart") as error:
+        compare(made)
+    for record in (made[0], made[2]):
+        assert str(record.path) in str(error.value)
+    elsewhere = fake(**{"values": FRONT, "env": "F", **same, **other})
+    assert len(compare([*made[:2], elsewhere])) == 2
 
 
 @pytest.mark.parametrize("unit", [1.0, 100.0])
@@ -276,14 +363,59 @@ def test_distance_to_the_front_of_all_by_hand(fake, unit: float) -> None:
     assert distances["worse"] == pytest.approx((0.5 + np.hypot(0.5, 0.5) + 0.5) / 3)
 
 
-def test_a_front_of_one_point_has_distances(fake) -> None:
-    task = only(compare([fake([[2.0, 2.0]] * 3, label="a"), fake([[1.0, 2.0]] * 3, label="b")]))
-    assert {name: runs[0].inverted_generational_distance for name, runs in task.methods.items()} == {"a": 0.0, "b": 1.0}
+def test_a_front_of_one_point_has_no_distances(fake) -> None:
+    """It has no range that could become [0, 1]."""
+    made = [fake([[2.0, 2.0]] * 3, label="a"), fake([[1.0, 2.0]] * 3, label="b"), fake(None, error=BAD, label="c")]
+    task = only(compare(made))
+    np.testing.assert_array_equal(task.reference_front, [[2, 2]])
+    assert np.isnan([runs[0].inverted_generational_distance for runs in task.methods.values()]).all()
+    assert np.isnan([distance for _, _, distance in task.floors.values()]).all()
+    assert task.methods["c"][0].expected_utility == 0.5
 
 
-def test_what_reads_can_be_compared(fake) -> None:
+def test_without_a_final_front_there_are_no_distances(fake) -> None:
+    task = only(compare([fake(None, {10: FRONT}, BAD), fake(None, error="cut off", seed=1)]))
+    assert task.reference_front.shape == (0, 2)
+    assert np.isnan([run.inverted_generational_distance for run in task.methods["a"]]).all()
+    assert np.isnan([distance for _, _, distance in task.floors.values()]).all()
+
+
+def test_a_front_that_is_flat_on_one_axis_is_no_error(fake, tmp_path) -> None:
+    """Three objectives of which one is the same for all solutions of the front."""
+    shape = {"reference_point": [0.0] * 3, "preferences": np.eye(3), "floors": {"standing still": np.full((3, 3), 0.5)}}
+    made = [fake([[1.0, 3.0, 2.0], [2.0, 2.0, 2.0], [3.0, 1.0, 2.0]], **shape), fake(np.ones((3, 3)), label="b", **shape)]
+    task = only(compare(made))
+    np.testing.assert_array_equal(task.reference_front, [[1, 3, 2], [2, 2, 2], [3, 1, 2]])
+    distances = [runs[0].inverted_generational_distance for runs in task.methods.values()]
+    assert not np.isinf(distances).any()
+    assert distances[0] == 0 or np.isnan(distances[0])
+    report_of(tmp_path / "report", made)
+
+
+def test_the_reference_front_does_not_depend_on_the_preferences(fake) -> None:
+    """A solution that is best only for a preference that nobody asked for belongs to it."""
+    values = [[0.0, 4.0], [2.5, 2.5], [4.0, 0.0]]
+    expected = convex_envelope(values)
+    np.testing.assert_array_equal(expected, values)
+    for preferences in ([[0.0, 1.0], [0.1, 0.9], [1.0, 0.0]], PREFERENCES, [[1.0, 0.0]] * 3):
+        task = only(compare([fake(values, preferences=preferences, floors={})]))
+        np.testing.assert_array_equal(task.reference_front, expected)
+
+
+def test_what_no_preference_likes_best_is_not_in_the_reference_front(fake) -> None:
+    """Of all methods; what was measured before the end does not count."""
+    made = [
+        fake([[0.0, 4.0], [1.0, 2.0], [2.0, 1.9]], {10: [[9.0, 9.0]] * 3}, label="a"),
+        fake([[4.0, 0.0], [3.0, 2.0], [0.0, 4.0]], label="b"),
+        fake(None, {10: [[9.0, 9.0]] * 3}, BAD, label="c"),
+    ]
+    np.testing.assert_array_equal(only(compare(made)).reference_front, [[0, 4], [3, 2], [4, 0]])
+
+
+@pytest.mark.parametrize("general_policy", [True, False])
+def test_what_reads_can_be_compared(fake, general_policy: bool) -> None:
     """Damaged numbers that pass as a record give results or a ValueError, never another exception."""
-    record = fake(FRONT, {10: box(2.0), 20: FRONT})
+    record = fake(FRONT, {10: box(2.0), 20: FRONT}, general_policy=general_policy)
     lines = [json.loads(line) for line in record.path.read_text().splitlines()]
     keys = [(i, key) for i, line in enumerate(lines) for key in line if key not in ("event", "format", "version", "values")]
     odd = [None, True, -1, 0.5, 10**20, 10**400, "a", "nan", [], {}, [1.0, 2.0], {"a": None}, {"a": {"b": [1]}}]
@@ -300,6 +432,129 @@ def test_what_reads_can_be_compared(fake) -> None:
             assert len(tasks) == 1, (key, value)
             compared += 1
     assert compared > 0
+
+
+# ----------------------------------------------------------------------------------------------------- convex envelope
+
+
+ENVELOPES = {
+    "one point": ([[2.0, 3.0]], [0]),
+    "one point twice": ([[2.0, 3.0]] * 2, [0]),
+    "a dominated point": ([[1.0, 1.0], [2.0, 2.0]], [1]),
+    "beyond the line of its neighbours": ([[0.0, 1.0], [0.6, 0.6], [1.0, 0.0]], [0, 1, 2]),
+    "on the line of its neighbours": ([[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]], [0, 1, 2]),
+    "short of the line of its neighbours": ([[0.0, 1.0], [0.4, 0.5], [1.0, 0.0]], [0, 2]),
+    "just short of it": ([[0.0, 1.0], [0.5, 0.4999999], [1.0, 0.0]], [0, 2]),
+    "objectives of different units": ([[0.0, 1e-6], [4e5, 5e-7], [6e5, 6e-7], [1e6, 0.0]], [0, 2, 3]),
+    "objectives of tiny units": ([[0.0, 1e-10], [4e-11, 5e-11], [1e-10, 0.0]], [0, 2]),
+    "below 0": ([[-5.0, -1.0], [-4.0, -4.0], [-2.0, -2.0], [-1.0, -5.0]], [0, 2, 3]),
+    "a tie of one objective": ([[0.0, 1.0], [0.5, 1.0], [1.0, 0.0], [1.0, -1.0]], [1, 2]),
+    "a tie of one objective, of few points": ([[1.0, 1.0], [1.0, 0.0]], [0]),
+    "one objective": ([[1.0], [3.0], [2.0], [3.0]], [1]),
+    "the corners of a simplex": (np.eye(3), [0, 1, 2]),
+    "beyond the plane of its neighbours": ([*np.eye(3), [0.34, 0.34, 0.34]], [0, 1, 2, 3]),
+    "on the plane of its neighbours": ([*np.eye(3), [0.25, 0.25, 0.5]], [0, 1, 2, 3]),
+    "short of the plane of its neighbours": ([*np.eye(3), [0.3, 0.3, 0.3]], [0, 1, 2]),
+    "best only where the third objective counts nothing": ([*np.eye(3), [0.6, 0.6, -5.0]], [0, 1, 2, 3]),
+    "best nowhere, with a third objective that is low": ([*np.eye(3), [0.4, 0.4, -5.0]], [0, 1, 2]),
+    "best only for the third objective, with others": ([[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [0.5, 0.5, 1.0]], [0, 1, 2]),
+    "best for the third objective, but dominated": ([[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [0.0, 0.5, 1.0]], [0, 1]),
+    "one that is flat": ([[0.0, 1.0, 7.0], [0.6, 0.6, 7.0], [1.0, 0.0, 7.0], [0.4, 0.4, 7.0]], [0, 1, 2]),
+    "a dominated one that ties with the best": ([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 2.0]], [2, 3]),
+}
+
+
+@pytest.mark.parametrize(("values", "best"), ENVELOPES.values(), ids=ENVELOPES)
+def test_convex_envelopes_by_hand(values: Any, best: list[int]) -> None:
+    """Whatever the order, and however often each one is there."""
+    values = np.asarray(values, dtype=np.float64)
+    expected = np.unique(values[best], axis=0)
+    for given in (values, values[::-1], np.repeat(values, 2, axis=0)):
+        np.testing.assert_array_equal(convex_envelope(given), expected)
+
+
+def upper_vertices(points: np.ndarray) -> np.ndarray:
+    """Corners of the hull between the best of the one objective and the best of the other, (n, 2)."""
+    hull = ConvexHull(points)
+    upper = hull.simplices[(hull.equations[:, :2] >= 0).all(axis=1)]
+    corners = {*upper.ravel().tolist(), *points.argmax(axis=0).tolist()}
+    return np.unique(points[sorted(corners)], axis=0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_convex_envelopes_of_random_points_are_the_upper_vertices_of_their_hull(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 60))
+    angles = rng.uniform(0, np.pi / 2, n)
+    arc = np.stack([np.cos(angles), np.sin(angles)], axis=1) * rng.choice([1.0, 0.99, 0.5], (n, 1))
+    for points in (rng.normal(size=(n, 2)), rng.uniform(size=(n, 2)), arc):
+        for units in ([1.0, 1.0], [1e-3, 1e4]):
+            np.testing.assert_array_equal(convex_envelope(points * units), upper_vertices(points * units))
+
+
+def upper_chain(points: np.ndarray) -> np.ndarray:
+    """Non-dominated points above which no line between two others runs, in exact arithmetic, (n, 2)."""
+    exact = sorted({(Fraction(x), Fraction(y)) for x, y in points.tolist()})
+    best = [(x, y) for i, (x, y) in enumerate(exact) if all(y > other for _, other in exact[i + 1 :])]
+    chain: list[tuple[Fraction, Fraction]] = []
+    for x, y in best:
+        while len(chain) > 1:
+            (ax, ay), (bx, by) = chain[-2:]
+            if (bx - ax) * (y - ay) <= (by - ay) * (x - ax):
+                break
+            chain.pop()
+        chain.append((x, y))
+    return np.array(chain, dtype=np.float64)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_convex_envelopes_of_points_with_many_ties(seed: int) -> None:
+    """Integers, which lie on lines and in rows: on a line all belong to it, of a row only the best."""
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, rng.integers(2, 12), (int(rng.integers(1, 60)), 2)).astype(np.float64)
+    np.testing.assert_array_equal(convex_envelope(points), upper_chain(points))
+
+
+@pytest.mark.parametrize("n_objectives", [2, 3, 4])
+@pytest.mark.parametrize("kind", ["normal", "integers"])
+def test_convex_envelopes_hold_what_each_preference_likes_best(n_objectives: int, kind: str) -> None:
+    """With only non-dominated points, each one once."""
+    rng = np.random.default_rng(n_objectives)
+    shape = (40, n_objectives)
+    points = rng.normal(size=shape) if kind == "normal" else rng.integers(0, 4, shape).astype(np.float64)
+    envelope = convex_envelope(points)
+    assert {tuple(v) for v in envelope.tolist()} <= {tuple(v) for v in points.tolist()}
+    assert non_dominated(envelope).all()
+    others_are_better = (points[None] >= envelope[:, None]).all(axis=2) & (points[None] > envelope[:, None]).any(axis=2)
+    assert not others_are_better.any()
+    preferences = rng.dirichlet(np.full(n_objectives, 0.5), 3_000)
+    np.testing.assert_allclose((envelope @ preferences.T).max(axis=0), (points @ preferences.T).max(axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("n_objectives", [2, 3, 4])
+def test_convex_envelopes_of_random_points_are_the_corners_of_what_they_dominate(n_objectives: int) -> None:
+    """Of the points and their shadows, of which some coordinates are lower than any point's."""
+    rng = np.random.default_rng(n_objectives)
+    for _ in range(3):
+        points = rng.normal(size=(30, n_objectives))
+        shadows = [np.where(low, points.min() - 1, points) for low in np.ndindex((2,) * n_objectives)]
+        dominated = np.concatenate(shadows)
+        corners = ConvexHull(dominated).vertices
+        expected = np.unique(dominated[corners[corners < len(points)]], axis=0)
+        np.testing.assert_array_equal(convex_envelope(points), expected)
+
+
+def test_all_points_of_a_plane_are_in_its_envelope() -> None:
+    """66 points that tie, in units that no binary number holds exactly."""
+    grid = np.array([(a, b, 10 - a - b) for a in range(11) for b in range(11 - a)]) * [1 / 3, 7.7, 1234.5]
+    assert len(convex_envelope(grid)) == 66
+    assert len(convex_envelope(np.concatenate([grid, 0.999 * grid - 0.001]))) == 66
+
+
+@pytest.mark.parametrize("values", [np.zeros((0, 2)), [1.0, 2.0], [[1.0, np.nan]], [[np.inf, 1.0]]], ids=str)
+def test_what_has_no_convex_envelope_is_an_error(values: Any) -> None:
+    with pytest.raises(ValueError, match="values"):
+        convex_envelope(values)
 
 
 # -------------------------------------------------------------------------------------------------------------- curves
@@ -334,11 +589,22 @@ def test_curves_of_runs_that_all_failed(fake) -> None:
     runs = curves_of(fake, ({}, False), ({}, False))
     steps, curves = curve_on(runs)
     assert (steps.shape, curves.shape) == ((0,), (2, 0))
-    assert areas_under_curve(runs) == [0, 0]
+    areas = areas_under_curve(runs)
+    assert len(areas) == 2
+    assert np.isnan(areas).all()
 
 
-def test_one_evaluation_is_its_own_mean(fake) -> None:
-    assert areas_under_curve(curves_of(fake, ({10: 3}, True), ({10: 5}, False))) == [3, 0]
+def test_one_evaluation_makes_no_area(fake) -> None:
+    with np.errstate(all="raise"):
+        areas = areas_under_curve(curves_of(fake, ({10: 3}, True), ({10: 5}, False), ({}, False)))
+    assert len(areas) == 3
+    assert np.isnan(areas).all()
+
+
+def test_an_area_begins_at_the_first_evaluation(fake) -> None:
+    """Of the method, in units of its hypervolume: whose volume is constant has it as its mean."""
+    runs = curves_of(fake, ({10: 3, 40: 3}, True), ({10: 1, 20: 2, 40: 8}, True))
+    np.testing.assert_allclose(areas_under_curve(runs), [3, (15 + 100) / 30])
 
 
 @pytest.mark.parametrize(
@@ -355,9 +621,25 @@ def test_the_median_run_is_a_finished_one(fake, volumes: list[float | None], med
 # -------------------------------------------------------------------------------------------------------------- report
 
 
-def report_of(folder: Path, made: Sequence[Record]) -> str:
+@pytest.mark.parametrize(
+    ("estimate", "text"),
+    [
+        (Estimate(1.0, 1.0, 1.0), "1"),
+        (Estimate(0.0, 0.0, 0.0), "0"),
+        (Estimate(12345.678, 12345.678, 12345.678), "1.235e+04"),
+        (Estimate(1.0, 0.5, 2.0), "1 [0.5, 2]"),
+        (Estimate(-1.0, -1.0, 0.25), "-1 [-1, 0.25]"),
+        (Estimate(1234.0, 1000.0, 1234.0), "1,234 [1,000, 1,234]"),
+    ],
+    ids=str,
+)
+def test_an_interval_is_printed_where_it_has_width(estimate: Estimate, text: str) -> None:
+    assert as_text(estimate) == text
+
+
+def report_of(folder: Path, made: Sequence[Record], baseline: str | None = None) -> str:
     """The report's text, whose pictures all exist and whose tables are whole."""
-    text = write_report(compare(made), made, folder)
+    text = write_report(compare(made), made, folder, baseline)
     assert (folder / "report.md").read_text() == text
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text)
     assert len(set(pictures)) == len(pictures), pictures
@@ -384,12 +666,17 @@ def test_a_report_of_two_objectives(fake, tmp_path) -> None:
     assert len(list((tmp_path / "report").glob("*.png"))) == 2
     row = rows_of(text, "b")[0]
     assert row[1:4] == ["2/2", "20", "210"]
-    assert [float(cell.split()[0]) for cell in row[4:]] == pytest.approx([6, 8 / 3, 0, 0, 4], rel=1e-3)
+    assert row[4:] == ["6", "2.667", "0", "0", "4"]  # Equal runs have no interval.
     assert rows_of(text, "a")[0][1:3] == ["1/3", "20"]
-    assert rows_of(text, r"(standing still)")[0][4:6] == ["1", "1"]
-    assert rows_of(text, r"(random actions)")[0][4:6] == ["0.25", "0.5"]
-    assert rows_of(text, "b")[1][1].startswith("1 [1, 1]")  # P(b > a)
-    assert rows_of(text, "a")[1][2].startswith("0 [0, 0]")
+    cells = rows_of(text, "a")[0][4:]
+    assert [float(cell.split()[0]) for cell in cells] == pytest.approx(
+        [1 / 3, (1 + 0.5 + 0.5) / 3, 0, (STILL_DISTANCE + 2 * RANDOM_DISTANCE) / 3, (1 + 0.5 + 0) / 3], rel=1e-3
+    )
+    assert ["[" in cell for cell in cells] == [True, True, False, True, True]  # The regret is of one run.
+    assert rows_of(text, r"(standing still)")[0][4:] == ["1", "1", "", f"{STILL_DISTANCE:.4g}", ""]
+    assert rows_of(text, r"(random actions)")[0][4:] == ["0.25", "0.5", "", f"{RANDOM_DISTANCE:.4g}", ""]
+    assert rows_of(text, "b")[1][1] == "1 (1 tasks)"  # P(b > a)
+    assert rows_of(text, "a")[1][2] == "0 (1 tasks)"
     assert "seed 1: RuntimeError: diverged" in text
     assert "seed 2: no end" in text
     assert f"sb3_momba {made[0].start['versions']['sb3_momba']}" in text
@@ -409,7 +696,34 @@ def test_fronts_are_drawn_of_two_or_three_objectives(fake, tmp_path, n_objective
 def test_a_report_of_one_evaluation(fake, tmp_path) -> None:
     text = report_of(tmp_path / "report", [fake(FRONT, {10: FRONT}, floors={})])
     assert rows_of(text, "a")[0][1:3] == ["1/1", "10"]
+    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", ""]  # A curve of one point has no mean.
     assert "improvement" not in text
+    assert "## Aggregate" not in text
+
+
+def test_a_report_of_sets_of_solutions(fake, tmp_path) -> None:
+    """Their regret is unknown, beside that of a general policy."""
+    curve = {10: box(1.0), 20: FRONT}
+    made = [fake(FRONT, curve), fake([*FRONT, *box(1.0)], {10: [[1.0, 1.0]], 20: FRONT}, label="b", general_policy=False)]
+    text = report_of(tmp_path / "report", made)
+    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", "3.5"]
+    assert rows_of(text, "b")[0][4:] == ["6", "2.667", "", "0", "3.5"]
+    assert len(list((tmp_path / "report").glob("*.png"))) == 2
+
+
+def test_a_report_of_one_solution_has_no_distances(fake, tmp_path) -> None:
+    text = report_of(tmp_path / "report", [fake(box(2.0)), fake(None, error=BAD, seed=1)])
+    for name in ("a", "(standing still)", "(random actions)"):
+        assert rows_of(text, name)[0][7] == ""
+
+
+def test_a_report_without_floors_leaves_blank_what_is_unknown_of_a_run_that_failed(fake, tmp_path) -> None:
+    made = [fake(FRONT, floors={}), fake(None, error=BAD, floors={}, seed=1), fake(None, error=BAD, floors={}, label="b")]
+    text = report_of(tmp_path / "report", made)
+    hypervolume, *others = rows_of(text, "a")[0][4:]
+    assert hypervolume.startswith("3 [0, 6]")
+    assert others == ["2.667", "0", "0", ""]  # Those of the run that is known.
+    assert rows_of(text, "b")[0][4:] == ["0", "", "", "", ""]
 
 
 @pytest.mark.parametrize("curve", [{}, {10: box(1.0), 20: box(2.0)}], ids=["never evaluated", "evaluated"])
@@ -417,14 +731,110 @@ def test_a_report_of_runs_that_all_failed(fake, tmp_path, curve: dict[int, Any])
     made = [fake(None, curve, error, label=label, floors={}) for label in "ab" for error in (BAD, "cut off")]
     text = report_of(tmp_path / "report", made)
     assert rows_of(text, "a")[0][1] == rows_of(text, "b")[0][1] == "0/2"
+    area = rows_of(text, "a")[0][-1]
+    assert area.startswith("1.5") if curve else area == ""
     assert text.count("diverged") == 2
+    assert text.count(UNENDED) == 2
 
 
 def test_a_report_of_tasks_that_share_one_method(fake, tmp_path) -> None:
     made = [fake(FRONT, env="E"), fake(box(1.0), env="F", label="b"), fake(FRONT, env="F")]
     text = report_of(tmp_path / "report", made)
     assert text.index("## E") < text.index("## F")
-    assert rows_of(text, "b")[1][1].startswith("0 [0, 0]")
+    assert rows_of(text, "b")[1][1] == "0 (1 tasks)"
+
+
+def test_runs_without_an_end_are_counted_before_anything_else(fake, tmp_path) -> None:
+    made = [fake(FRONT), fake(None, error="cut off", seed=1), fake(None, error=BAD, seed=2), fake(None, env="F")]
+    text = report_of(tmp_path / "report", made)
+    assert "**2 runs have no end" in text.split("## ")[0]
+    assert "have no end" not in report_of(tmp_path / "other", [made[0], made[2]])
+
+
+def test_seeds_that_other_methods_have_are_named(fake, tmp_path) -> None:
+    """Their runs may have died before they could begin a record. On each task for itself; a run that failed is there."""
+    made = [fake(FRONT, seed=seed) for seed in (0, 1, 2)]
+    made += [fake(None, error=BAD, label="b", seed=1), fake(FRONT, label="c", seed=3)]
+    made += [fake(FRONT, env="F", label=label, seed=7) for label in "ab"]
+    text = report_of(tmp_path / "report", made)
+    missing = [line for line in text.splitlines() if line.startswith("Not recorded")]
+    expected = ["a, seed 3", "b, seed 0", "b, seed 2", "b, seed 3", "c, seed 0", "c, seed 1", "c, seed 2"]
+    assert missing == [f"Not recorded: {run}." for run in expected]
+    assert text.index("## E") < text.index(missing[0])
+    assert text.index(missing[-1]) < text.index("## F")
+    assert "Recorded more than once" not in text
+
+
+def test_seeds_that_were_recorded_twice_are_named(fake, tmp_path) -> None:
+    text = report_of(tmp_path / "report", [fake(FRONT), fake(FRONT), fake(FRONT, seed=1)])
+    assert [line for line in text.splitlines() if "ecorded" in line] == ["Recorded more than once: a, seed 0."]
+
+
+# ----------------------------------------------------------------------------------------------------------- aggregate
+
+
+def aggregate_of(text: str) -> dict[str, list[str]]:
+    """The cells of each method in the aggregate over tasks."""
+    after = text.split("## Aggregate\n")[1].split("\n## ")[0]
+    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in after.splitlines() if line.startswith("|")]
+    header, _, *rows = table
+    assert header == ["method", "tasks", "normalised hypervolume", "normalised expected utility"]
+    assert len({row[0] for row in rows}) == len(rows)
+    return {name: cells for name, *cells in rows}
+
+
+def value_of(cell: str) -> float:
+    return float(cell.split()[0])
+
+
+def test_the_aggregate_by_hand(fake, tmp_path) -> None:
+    """A box of volume v has the expected utility (1 + v) / 2; the baseline's IQM is 3 and 2 on E, 10 and 5.5 on F."""
+    made = [fake(box(volume), env="E", label="a", seed=seed) for seed, volume in enumerate([2.0, 4.0])]
+    made += [fake(box(10.0), env="F", label="a")]
+    made += [fake(box(volume), env="E", label="b", seed=seed) for seed, volume in enumerate([6.0, 9.0])]
+    made += [fake(box(5.0), env="F", label="b", seed=seed) for seed in range(2)]
+    made += [fake(box(5.0), env="F", label="c")]
+    text = report_of(tmp_path / "report", made, "a")
+    cells = aggregate_of(text)
+    assert {name: row[0] for name, row in cells.items()} == {"a": "2", "b": "2", "c": "1"}
+    # Of a: 2/3, 4/3 and 1, and 1.5/2, 2.5/2 and 1. Of b: 2, 3 and twice 1/2, of which the middle half is 1/2 and 2.
+    assert [value_of(cell) for cell in cells["a"][1:]] == pytest.approx([1, 1], rel=1e-3)
+    assert [value_of(cell) for cell in cells["b"][1:]] == pytest.approx([(0.5 + 2) / 2, (3 / 5.5 + 3.5 / 2) / 2], rel=1e-3)
+    assert all("[" in cell for name in "ab" for cell in cells[name][1:])
+    assert cells["c"][1:] == ["0.5", f"{3 / 5.5:.4g}"]
+    assert "In units of the IQM of a on each task" in text
+    assert text.index("## F") < text.index("## Aggregate")
+    assert "## Aggregate" not in report_of(tmp_path / "other", made)
+
+
+def test_the_baselines_unit_is_an_interquartile_mean(fake, tmp_path) -> None:
+    """Of 100, 4, 2 and 0 the middle half has the mean 3."""
+    made = [fake(box(volume), label="a", seed=seed) for seed, volume in enumerate([100.0, 4.0, 2.0])]
+    made += [fake(None, error=BAD, label="a", seed=3), fake(box(6.0), label="b")]
+    cells = aggregate_of(report_of(tmp_path / "report", made, "a"))
+    assert cells["b"][1] == "2"
+    assert value_of(cells["a"][1]) == 1
+
+
+def test_tasks_without_the_baseline_are_not_in_the_aggregate(fake, tmp_path) -> None:
+    made = [fake(box(2.0), label="a"), fake(box(4.0), label="b"), fake(box(99.0), env="F", label="b")]
+    made += [fake(box(1.0), env="F", label="c")]
+    cells = aggregate_of(report_of(tmp_path / "report", made, "a"))
+    assert cells == {"a": ["1", "1", "1"], "b": ["1", "2", f"{2.5 / 1.5:.4g}"], "c": ["0", "", ""]}
+
+
+def test_what_is_unknown_or_has_no_unit_is_blank_in_the_aggregate(fake, tmp_path) -> None:
+    made = [fake(box(2.0), label="a", floors={}), fake(None, error=BAD, label="b", floors={})]
+    assert aggregate_of(report_of(tmp_path / "report", made, "a")) == {"a": ["1", "1", "1"], "b": ["1", "0", ""]}
+    assert aggregate_of(report_of(tmp_path / "other", made, "b")) == {"a": ["1", "", ""], "b": ["1", "", ""]}
+
+
+def test_a_baseline_that_nobody_has_is_an_error_that_names_who_is_there(fake, tmp_path) -> None:
+    made = [fake(FRONT, label="momba"), fake(FRONT, env="F", label="capql")]
+    with pytest.raises(ValueError, match="'capq'") as error:
+        report_of(tmp_path / "report", made, "capq")
+    assert "capql, momba" in str(error.value)
+    assert not (tmp_path / "report" / "report.md").exists()
 
 
 def test_names_that_markdown_would_take_for_its_own(fake, tmp_path) -> None:
@@ -465,8 +875,42 @@ def test_report_from_the_command_line(fake, tmp_path, capsys) -> None:
     main(["report", str(record.path), "--output", str(tmp_path / "new" / "place"), "--reference-point", "-1", "-1"])
     text = (tmp_path / "new" / "place" / "report.md").read_text()
     assert "[-1.0, -1.0]" in text
-    assert rows_of(text, "a")[0][4].startswith("13 ")  # 2 x 4 + 1 x 3 + 1 x 2
+    assert rows_of(text, "a")[0][4] == "13"  # 2 x 4 + 1 x 3 + 1 x 2
     assert str(tmp_path / "new" / "place" / "report.md") in capsys.readouterr().out
+
+
+def test_a_baseline_from_the_command_line(fake, tmp_path) -> None:
+    fake(box(2.0), label="a")
+    fake(box(4.0), label="b")
+    main(["report", str(tmp_path / "records"), "--baseline", "a"])
+    assert aggregate_of((tmp_path / "records" / "report.md").read_text())["b"][:2] == ["1", "2"]
+    message = error_of("report", tmp_path / "records", "--baseline", "c")
+    assert "'c'" in message
+    assert "a, b" in message
+
+
+@pytest.mark.parametrize("content", [b"", b'{"event": "start", "format": "sb3_mom'], ids=["empty", "torn"])
+def test_a_record_that_was_cut_off_in_its_first_line_is_left_out(fake, tmp_path, capsys, content: bytes) -> None:
+    torn = tmp_path / "records" / "torn" / "record.jsonl"
+    torn.parent.mkdir(parents=True)
+    torn.write_bytes(content)
+    assert "first line" in error_of("report", tmp_path / "records")
+    assert not (tmp_path / "records" / "report.md").exists()
+    capsys.readouterr()
+    fake(FRONT)
+    main(["report", str(tmp_path / "records")])
+    said = [line for line in capsys.readouterr().out.splitlines() if str(torn) in line]
+    assert len(said) == 1
+    assert "cut off in its first line" in said[0]
+    text = (tmp_path / "records" / "report.md").read_text()
+    assert rows_of(text, "a")[0][1] == "1/1"
+    assert str(torn) not in text
+
+
+def test_records_that_were_evaluated_differently_end_with_one_line_of_error(fake, tmp_path) -> None:
+    made = [fake(FRONT, settings={"n_episodes": n}, seed=n) for n in (5, 2)]
+    message = error_of("report", tmp_path / "records")
+    assert all(str(record.path) in message for record in made)
 
 
 def test_bad_input_ends_with_one_line_of_error(fake, tmp_path) -> None:
@@ -505,11 +949,8 @@ def test_a_damaged_count_of_parameters_is_one_line_of_error(fake, tmp_path, para
 
 
 def parsed(cell: Cell, folder: Path) -> train.RunSettings:
-    """What the training reads from a cell's command."""
-    python, *rest = cell.command(folder)
-    assert python == sys.executable
-    assert rest[:2] == ["-m", "sb3_momba.train"]
-    return train.parse(rest[2:])
+    """What the training reads from a cell's arguments."""
+    return train.parse(cell.arguments(folder))
 
 
 def test_cells_are_every_configuration_environment_and_seed(tmp_path) -> None:
@@ -522,6 +963,27 @@ def test_cells_are_every_configuration_environment_and_seed(tmp_path) -> None:
         settings = parsed(cell, tmp_path)
         assert (settings.env, settings.seed, settings.label) == (cell.env, cell.seed, cell.conf)
         assert (settings.steps, settings.n_episodes, settings.output) == (30_000, 2, str(tmp_path))
+        assert not settings.progress_bar
+
+
+def test_what_the_grid_says_wins_over_options(tmp_path) -> None:
+    """Each cell has the place, the task and the seed that its name says."""
+    options = ["--seed", "7", "--env", "MO-Ant-v4", "--output", "/elsewhere", "--conf", "capql", "--steps", "3e4"]
+    for cell in make_cells(["momba"], [ENV], 2, options):
+        settings = parsed(cell, tmp_path)
+        assert (settings.env, settings.seed, settings.output) == (ENV, cell.seed, str(tmp_path))
+        assert (settings.label, settings.steps) == ("momba", 30_000)
+
+
+def test_options_of_several_values_do_not_swallow_what_the_grid_says(tmp_path) -> None:
+    options = ["--reference-point", "-1", "-2", "--objectives", "speed", "height"]
+    settings = parsed(make_cells(["momba"], [ENV], 1, options)[0], tmp_path)
+    assert (settings.reference_point, settings.objectives, settings.env) == ([-1, -2], ["speed", "height"], ENV)
+
+
+def test_what_is_repeated_is_taken_once() -> None:
+    once = make_cells(["momba", "capql"], [ENV, "MO-Ant-v4"], 2)
+    assert make_cells(["momba", "capql", "momba"], [ENV, "MO-Ant-v4", ENV, ENV], 2) == once
 
 
 def test_the_start_of_alpha_is_for_configurations_that_learn_it(tmp_path) -> None:
@@ -549,23 +1011,126 @@ def test_environments_are_named_as_the_training_takes_them(env: str) -> None:
 
 
 def test_each_cell_has_a_folder_of_its_own(tmp_path) -> None:
-    """Two files of one name, in two folders, are two configurations; or it is an error."""
+    """Two files of one name, in two folders, are two configurations that would share one."""
     confs = []
     for gamma in (0.9, 0.99):
         path = tmp_path / str(gamma) / "mine.yml"
         path.parent.mkdir()
         path.write_text(f"default:\n  gamma: {gamma}\n")
         confs.append(str(path))
-    try:
-        cells = make_cells(confs, [ENV], 1)
-    except ValueError:
-        return
-    assert len({cell.name for cell in cells}) == len(cells)
+    with pytest.raises(ValueError, match="rename one of them") as error:
+        make_cells(confs, [ENV], 1)
+    assert all(conf in str(error.value) for conf in confs)
+    cells = make_cells([confs[0], "momba"], [ENV, "MO-Ant-v4"], 2)
+    assert len({cell.name for cell in cells}) == len(cells) == 8
 
 
 @pytest.mark.parametrize("seeds", ["0", "-1"])
 def test_a_grid_of_no_runs_is_an_error(tmp_path, seeds: str) -> None:
-    error_of("run", "--conf", "momba", "--env", ENV, "--seeds", seeds, "--output", tmp_path)
+    with pytest.raises(ValueError, match=f"seeds={seeds}"):
+        make_cells(["momba"], [ENV], int(seeds))
+    assert f"seeds={seeds}" in error_of("run", "--conf", "momba", "--env", ENV, "--seeds", seeds, "--output", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("processes", [0, -1])
+def test_a_grid_without_processes_is_an_error(training, tmp_path, processes: int) -> None:
+    fake_training = training()
+    output = tmp_path / "grid"
+    with pytest.raises(ValueError, match=f"processes={processes}"):
+        run_grid(make_cells(["momba"], [ENV], 1), output, processes=processes)
+    line = f"run --conf momba --env {ENV} --seeds 1 --output {output} --processes {processes}"
+    assert f"processes={processes}" in error_of(*line.split())
+    assert fake_training.seeds == []
+    assert not output.exists()
+
+
+UNKNOWN_ENVS = {
+    "mo-hoper-2obj-v5": "Did you mean: `mo-hopper-2obj`",
+    "MO-Hoper-v4": "Did you mean: `MO-Hopper`",
+    "mo-hopper-2obj-v9": "`v5`",
+    "mo_gymnasium:mo-hoper-2obj-v5": "Did you mean: `mo-hopper-2obj`",
+}
+
+
+@pytest.mark.parametrize(("env", "cure"), UNKNOWN_ENVS.items())
+def test_an_environment_that_does_not_exist_is_refused_before_anything_runs(training, tmp_path, env: str, cure: str) -> None:
+    fake_training = training()
+    output = tmp_path / "grid"
+    with pytest.raises(gym.error.Error, match=re.escape(cure)):
+        run_grid(make_cells(["momba"], [ENV, env], 2), output)
+    arguments = ["run", "--conf", "momba", "--env", ENV, env, "--seeds", "2", "--output", output]
+    assert cure in error_of(*arguments)
+    assert fake_training.seeds == []
+    assert not output.exists()
+
+
+def test_a_module_that_does_not_exist_is_one_line_of_error(training, tmp_path) -> None:
+    fake_training = training()
+    arguments = ["--seeds", "1", "--output", tmp_path / "grid"]
+    assert "nowhere" in error_of("run", "--conf", "momba", "--env", f"nowhere:{ENV}", *arguments)
+    assert fake_training.seeds == []
+
+
+def test_an_environment_of_a_module_is_run(training, tmp_path) -> None:
+    fake_training = training()
+    main(f"run --conf momba --env mo_gymnasium:{ENV} --seeds 1 --output {tmp_path}".split())
+    assert fake_training.seeds == [0]
+    assert read_record(tmp_path / "momba" / f"mo_gymnasium:{ENV}" / "0" / "record.jsonl").error is None
+
+
+@pytest.mark.parametrize("options", [["--stepz", "3"], ["--steps", "many"], ["--set"]], ids=" ".join)
+def test_options_that_the_training_does_not_have_are_refused_before_anything_runs(
+    training, tmp_path, capsys, options: list[str]
+) -> None:
+    fake_training = training()
+    output = tmp_path / "grid"
+    with pytest.raises(SystemExit) as stop:
+        main(["run", "--conf", "momba", "--env", ENV, "--seeds", "2", "--output", str(output), *options])
+    assert stop.value.code == 2
+    assert options[0] in capsys.readouterr().err
+    assert fake_training.seeds == []
+    assert not output.exists()
+
+
+def test_a_second_grid_on_the_same_folder_is_refused_while_one_runs(training, tmp_path, monkeypatch) -> None:
+    first, second = (make_cells([conf], [ENV], 1) for conf in ("momba", "capql"))
+    fake_training = training()
+    refusals: list[str] = []
+
+    def run_meanwhile(command: list[str], **kwargs: Any) -> SimpleNamespace:
+        monkeypatch.setattr(subprocess, "run", fake_training)
+        with pytest.raises(ValueError, match="Another grid runs in") as error:
+            run_grid(second, tmp_path / "grid")
+        refusals.append(str(error.value))
+        refusals.append(error_of("run", "--conf", "capql", "--env", ENV, "--seeds", "1", "--output", tmp_path / "grid"))
+        assert run_grid(second, tmp_path / "other") == 0
+        return fake_training(command, **kwargs)
+
+    monkeypatch.setattr(subprocess, "run", run_meanwhile)
+    assert run_grid(first, tmp_path / "grid") == 0
+    assert len(refusals) == 2
+    assert all(f"Another grid runs in {tmp_path / 'grid'}" in refusal for refusal in refusals)
+    assert not (tmp_path / "grid" / "capql").exists()
+    assert run_grid(second, tmp_path / "grid") == 0
+    assert len(fake_training.seeds) == 3
+
+
+def test_a_grid_that_was_killed_does_not_bar_the_next_one(training, tmp_path) -> None:
+    """Nor one that ended with an error."""
+    cells = make_cells(["momba"], [ENV], 1)
+    training()
+    with pytest.raises(RuntimeError, match="diverged"), alone_in(tmp_path):
+        raise BAD
+    code = "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print('locked', flush=True); input()"
+    command = [sys.executable, "-c", code, str(tmp_path / ".lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(ValueError, match="Another grid runs in"):
+            run_grid(cells, tmp_path)
+        other.kill()
+    assert run_grid(cells, tmp_path) == 0
 
 
 class FakeTraining:
@@ -577,6 +1142,7 @@ class FakeTraining:
         self.environments: list[dict[str, str]] = []
 
     def __call__(self, command: list[str], stdout: Any = None, env: Any = None, **kwargs: Any) -> SimpleNamespace:
+        assert command[:3] == [sys.executable, "-m", "sb3_momba.train"]
         settings = train.parse(command[3:])
         self.seeds.append(settings.seed)
         self.environments.append(env or dict(os.environ))
@@ -633,6 +1199,47 @@ def test_a_run_with_other_settings_is_not_taken_for_the_cells(training, tmp_path
     assert longer.seeds == []
 
 
+def test_a_run_that_was_cut_off_with_other_settings_is_not_thrown_away(training, tmp_path) -> None:
+    training({0: "is cut off"})
+    (cell,) = make_cells(["momba"], [ENV], 1, ["--steps", "3e4"])
+    run_grid([cell], tmp_path)
+    path = tmp_path / cell.name / "record.jsonl"
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"holds a run with other settings \(hyperparameters, steps\)"):
+        run_grid(make_cells(["momba"], [ENV], 1, ["--set", "gamma=0.5"]), tmp_path)
+    assert path.read_bytes() == before
+
+
+def test_settings_that_no_result_depends_on_may_differ(training, tmp_path) -> None:
+    """The processes that share an evaluation are not recorded."""
+    training()
+    run_grid(make_cells(["momba"], [ENV], 1), tmp_path)
+    again = training()
+    (cell,) = make_cells(["momba"], [ENV], 1, ["--eval-workers", "2"])
+    assert parsed(cell, tmp_path).eval_workers == 2
+    assert run_grid([cell], tmp_path) == 0
+    assert again.seeds == []
+    assert "eval_workers" not in read_record(tmp_path / cell.name / "record.jsonl").config
+
+
+def test_what_has_to_run(tmp_path) -> None:
+    (cell,) = make_cells(["momba"], [ENV], 1)
+    settings = parsed(cell, tmp_path)
+    content = {"settings": train.recorded_settings(settings), "env": ENV}
+    ended = {"finished": {"values": FRONT}, "failed": {"error": BAD}, "cut off": {"error": "cut off"}}
+    for name, end in ended.items():
+        write_record(tmp_path / name / "record.jsonl", **content, **end)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "record.jsonl").write_bytes((tmp_path / "finished" / "record.jsonl").read_bytes()[:100])
+    expected = {"finished": False, "failed": False, "cut off": True, "empty": True, "torn": True, "missing": True}
+    assert {name: has_to_run(tmp_path / name, settings) for name in expected} == expected
+    other = train.parse([*cell.arguments(tmp_path), "--n-episodes", "2"])
+    for name in ended:
+        with pytest.raises(ValueError, match=r"other settings \(n_episodes\)"):
+            has_to_run(tmp_path / name, other)
+
+
 def test_logs_lie_beside_the_folders(training, tmp_path) -> None:
     cells = make_cells(["momba"], [ENV], 2)
     training({1: "does not start"})
@@ -652,29 +1259,42 @@ def test_a_run_that_was_cut_off_in_its_first_line_is_run_again(training, tmp_pat
     assert fake_training.seeds == [0]
 
 
-def test_a_damaged_record_does_not_stop_the_others(training, tmp_path) -> None:
-    """The grid is refused before it starts, or all others are run. The record stays: it may be of a newer version."""
+def test_a_damaged_record_is_refused_before_anything_runs(training, tmp_path) -> None:
+    """The record stays: it may be of a newer version."""
     cells = make_cells(["momba"], [ENV], 6)
     path = tmp_path / cells[0].name / "record.jsonl"
     path.parent.mkdir(parents=True)
     path.write_text("damaged\n")
     fake_training = training()
     arguments = ["--conf", "momba", "--env", ENV, "--seeds", "6", "--output", tmp_path, "--processes", "1"]
-    error_of("run", *arguments)
+    assert str(path) in error_of("run", *arguments)
     assert path.read_text() == "damaged\n"
-    assert sorted(fake_training.seeds) in ([], [1, 2, 3, 4, 5])
+    assert fake_training.seeds == []
 
 
 def test_what_is_no_run_is_not_thrown_away(training, tmp_path) -> None:
     """A training refuses a folder with something in it; a grid only clears what a run left."""
-    (cell,) = make_cells(["momba"], [ENV], 1)
-    mine = tmp_path / cell.name / "thesis.txt"
+    cells = make_cells(["momba"], [ENV], 2)
+    mine = tmp_path / cells[1].name / "thesis.txt"
     mine.parent.mkdir(parents=True)
     mine.write_text("years of work")
-    training()
-    with contextlib.suppress(AssertionError, ValueError, OSError):
+    fake_training = training()
+    with pytest.raises(ValueError, match="holds something else than a run: choose another --output"):
+        run_grid(cells, tmp_path)
+    assert mine.read_text() == "years of work"
+    assert fake_training.seeds == []
+
+
+def test_a_file_in_the_place_of_a_folder_is_not_thrown_away(training, tmp_path) -> None:
+    (cell,) = make_cells(["momba"], [ENV], 1)
+    mine = tmp_path / cell.name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("years of work")
+    fake_training = training()
+    with pytest.raises(ValueError, match="holds something else than a run"):
         run_grid([cell], tmp_path)
-    assert mine.exists()
+    assert mine.read_text() == "years of work"
+    assert fake_training.seeds == []
 
 
 def test_a_grid_with_failures_ends_with_their_number(training, tmp_path) -> None:

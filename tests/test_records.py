@@ -1,5 +1,6 @@
 """Run records: what a run writes, that nothing written is lost, and that a reader meets no other surprise than an error."""
 
+import contextlib
 import getpass
 import inspect
 import json
@@ -7,6 +8,7 @@ import math
 import os
 import platform
 import re
+import resource
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -32,7 +34,7 @@ from sb3_momba.pareto.evaluation import evaluate_front
 from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy, evaluate_floors
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
-from sb3_momba.records import Record, RecordWriter, find_records, read_record
+from sb3_momba.records import UNENDED, Record, RecordWriter, find_records, is_cut_off_at_its_start, read_record
 from sb3_momba.train import RunSettings, main, plain, run
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
 from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
@@ -41,6 +43,7 @@ ENV = "mo-hopper-2obj-v5"
 TINY = {"learning_starts": 50, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
 METRICS = ("hypervolume", "expected_utility", "preference_regret", "n_non_dominated")
 PREFERENCES = [[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]]
+VALUES = [[1.0, 2.0]] * 3
 
 
 def settings_of(folder: Path, **changed: Any) -> RunSettings:
@@ -115,6 +118,18 @@ def valid(tmp_path) -> Path:
     return path
 
 
+@pytest.fixture
+def valid_set(tmp_path) -> Path:
+    """A finished record without a general policy: sets of 2, 1, 4 and 5 solutions, where there are 3 preferences."""
+    path = tmp_path / "valid_set.jsonl"
+    with writer_of(path, general_policy=False) as writer:
+        writer.append("floor", policy="random actions", values=[[1.0, 1.0]] * 2)
+        writer.append("evaluation", steps=10, seconds=1.5, values=[[1.0, 2.0]])
+        writer.append("evaluation", steps=20, seconds=3.0, values=[[2.0, 2.0]] * 4)
+        writer.finish(20, front_of([[1.0, 5.0], [2.0, 4.0], [3.0, 3.0], [4.0, 2.0], [5.0, 1.0]]))
+    return path
+
+
 # -------------------------------------------------------------------------------------------------- what a run writes
 
 
@@ -129,6 +144,7 @@ def test_a_record_holds_what_its_format_promises(tiny_run) -> None:
     assert (start["label"], start["env"], start["env_kwargs"], start["seed"]) == ("tiny", ENV, {}, 3)
     assert start["reference_point"] == [0.0, 0.0]
     assert start["preferences"] == PREFERENCES
+    assert start["general_policy"] is True
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", start["started"])
     for line in floors_and_curve:
         assert set(METRICS) <= set(line)
@@ -408,6 +424,45 @@ def test_each_line_is_on_disk_before_the_call_returns(tmp_path, monkeypatch) -> 
     assert lines_of(path)[-1]["status"] == "finished"
 
 
+def test_the_file_is_held_until_the_end(tmp_path) -> None:
+    """Who deletes the record of a run that still goes on finds none of its lines in the next one."""
+    path = tmp_path / "record.jsonl"
+    with writer_of(path) as writer:
+        path.unlink()
+        with writer_of(path, seed=1) as other:
+            writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+            writer.finish(1, front_of(VALUES))
+            assert [line["event"] for line in lines_of(path)] == ["start"]
+            other.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+            assert not other.file.closed
+    assert writer.file.closed
+    assert other.file.closed
+    record = read_record(path)
+    assert (record.seed, record.error) == (1, UNENDED)
+    assert [evaluation.steps for evaluation in record.evaluations] == [2]
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt(), SystemExit(3)], ids=repr)
+def test_what_is_interrupted_has_no_end_like_what_is_killed(tmp_path, interruption: BaseException) -> None:
+    path = tmp_path / "record.jsonl"
+    with pytest.raises(type(interruption)) as raised, writer_of(path) as writer:  # noqa: PT012
+        writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+        raise interruption
+    assert raised.value is interruption
+    assert writer.file.closed
+    assert [line["event"] for line in lines_of(path)] == ["start", "evaluation"]
+    record = read_record(path)
+    assert record.error == UNENDED
+    assert record.final_values is None
+    assert len(record.evaluations) == 1
+
+
+def test_leaving_without_an_end_writes_none(tmp_path) -> None:
+    with writer_of(tmp_path / "record.jsonl") as writer:
+        pass
+    assert read_record(writer.path).error == UNENDED
+
+
 @pytest.mark.parametrize("error", [RuntimeError("boom"), MemoryError("too large"), ValueError("two\nlines")])
 def test_an_error_inside_leaves_its_end(tmp_path, error: BaseException) -> None:
     path = tmp_path / "record.jsonl"
@@ -415,6 +470,7 @@ def test_an_error_inside_leaves_its_end(tmp_path, error: BaseException) -> None:
         writer.append("evaluation", steps=1, seconds=0.0, values=[[1.0, 2.0]] * 3)
         raise error
     assert raised.value is error
+    assert writer.file.closed
     *_, end = lines_of(path)
     assert (end["event"], end["status"]) == ("end", "failed")
     assert type(error).__name__ in end["error"]
@@ -437,12 +493,90 @@ def test_a_line_that_a_full_disk_cut_off_does_not_swallow_the_end(tmp_path) -> N
     assert len(record.evaluations) == 1
 
 
-def test_a_finished_run_stays_finished(tmp_path) -> None:
+@contextlib.contextmanager
+def room_for(n_bytes: int, path: Path) -> Iterator[None]:
+    """A disk that is full when the file has grown by this much."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + n_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("n_bytes", [0, 1, 40], ids=["no room", "room for a byte", "room for half a line"])
+def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path, n_bytes: int) -> None:
+    writer = writer_of(tmp_path / "record.jsonl")
+    writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+    before = writer.path.read_bytes()
+    for _ in range(2):
+        with pytest.raises(OSError, match=r"No space left|File too large"), room_for(n_bytes, writer.path):
+            writer.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+        assert writer.path.read_bytes() == before
+    writer.append("evaluation", steps=3, seconds=0.0, values=VALUES)
+    assert writer.path.read_bytes().startswith(before)
+    assert [evaluation.steps for evaluation in read_record(writer.path).evaluations] == [1, 3]
+
+
+def test_a_disk_that_was_full_for_a_while_leaves_the_failure(tmp_path) -> None:
+    path = tmp_path / "record.jsonl"
+    with pytest.raises(OSError, match="No space left"), writer_of(path) as writer:  # noqa: PT012
+        writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+        with room_for(40, path):
+            writer.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+    assert [line["event"] for line in lines_of(path)] == ["start", "evaluation", "end"]
+    record = read_record(path)
+    assert record.error is not None
+    assert record.error.startswith("OSError: ")
+    assert "No space left" in record.error
+    assert len(record.evaluations) == 1
+
+
+def test_a_disk_that_stays_full_leaves_whole_lines_without_an_end(tmp_path) -> None:
+    path = tmp_path / "record.jsonl"
+    writer = writer_of(path)
+    before = path.read_bytes()
+    with room_for(40, path), pytest.raises(OSError, match="No space left"), writer:
+        writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+    assert writer.file.closed
+    assert path.read_bytes() == before
+    assert read_record(path).error == UNENDED
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()], ids=repr)
+def test_a_line_that_does_not_reach_the_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch, error: BaseException) -> None:
+    writer = writer_of(tmp_path / "record.jsonl")
+    before = writer.path.read_bytes()
+
+    def fsync(fd: int) -> None:
+        raise error
+
+    with monkeypatch.context() as patch, pytest.raises(type(error)):  # noqa: PT012
+        patch.setattr(os, "fsync", fsync)
+        writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+    assert writer.path.read_bytes() == before
+    writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+    assert len(read_record(writer.path).evaluations) == 1
+
+
+def test_a_first_line_that_does_not_reach_the_disk_leaves_nothing_of_it(tmp_path, monkeypatch) -> None:
+    def fsync(fd: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    path = tmp_path / "record.jsonl"
+    with pytest.raises(OSError, match="Input/output error"):
+        writer_of(path)
+    assert not path.exists() or path.read_bytes() == b""
+
+
+@pytest.mark.parametrize("error", [RuntimeError("afterwards"), KeyboardInterrupt()], ids=repr)
+def test_a_finished_run_stays_finished(tmp_path, error: BaseException) -> None:
     """An end is the last line."""
     path = tmp_path / "record.jsonl"
-    with pytest.raises(RuntimeError), writer_of(path) as writer:  # noqa: PT012
+    with pytest.raises(type(error)), writer_of(path) as writer:  # noqa: PT012
         writer.finish(1, front_of([[1.0, 2.0]] * 3))
-        raise RuntimeError("afterwards")
+        raise error
     assert [line["event"] for line in lines_of(path)] == ["start", "end"]
     assert read_record(path).error is None
 
@@ -477,7 +611,7 @@ def test_what_json_cannot_hold_is_an_error_that_names_it(tmp_path) -> None:
     assert writer.path.read_bytes() == before
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("diverged")], ids=repr)
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3), RuntimeError("diverged")], ids=repr)
 def test_a_run_that_breaks_off_leaves_a_readable_record(tmp_path, monkeypatch, error: BaseException) -> None:
     def learn(model: MOMBA, *args: Any, **kwargs: Any) -> None:
         raise error
@@ -491,6 +625,7 @@ def test_a_run_that_breaks_off_leaves_a_readable_record(tmp_path, monkeypatch, e
     assert record.error == ("RuntimeError: diverged" if isinstance(error, Exception) else UNENDED)
     assert [floor.policy for floor in record.floors] == ["standing still", "random actions"]
     assert record.evaluations == []
+    assert (tmp_path / "run" / "model.zip").exists()
 
 
 def test_a_bound_that_is_infinite_is_a_setting_like_others(tmp_path, monkeypatch) -> None:
@@ -518,15 +653,47 @@ def test_a_record_reads_as_it_was_written(valid) -> None:
     assert record.config == {"hyperparameters": {"gamma": 0.99}}
     np.testing.assert_array_equal(record.reference_point, [0, 0])
     np.testing.assert_array_equal(record.preferences, PREFERENCES)
+    assert record.general_policy is True
     assert [floor.policy for floor in record.floors] == ["standing still", "random actions"]
     assert [(e.steps, e.seconds) for e in record.evaluations] == [(10, 1.5), (20, 3.0)]
     np.testing.assert_array_equal(record.evaluations[0].values, [[1, 2]] * 3)
     np.testing.assert_array_equal(record.final_values, [[1, 3], [2, 2], [3, 1]])
 
 
+def test_without_a_general_policy_values_are_sets_of_any_number(valid_set) -> None:
+    record = read_record(valid_set)
+    assert (record.general_policy, record.error) == (False, None)
+    np.testing.assert_array_equal(record.preferences, PREFERENCES)
+    np.testing.assert_array_equal(record.floors[0].values, [[1, 1]] * 2)
+    assert [evaluation.values.tolist() for evaluation in record.evaluations] == [[[1, 2]], [[2, 2]] * 4]
+    np.testing.assert_array_equal(record.final_values, [[1, 5], [2, 4], [3, 3], [4, 2], [5, 1]])
+
+
+def test_without_a_general_policy_values_still_are_of_the_tasks_objectives(valid_set) -> None:
+    whole = valid_set.read_bytes()
+    for change in (
+        put(1, "values", [[1.0]]),
+        put(2, "values", [[1.0, 2.0, 3.0]] * 3),
+        put(3, "values", []),
+        put(3, "values", [[1.0, 2.0], [1.0]]),
+        put(-1, "front", "returns", []),
+        put(-1, "front", "returns", [[[1.0, 2.0, 3.0]]] * 3),
+    ):
+        valid_set.write_bytes(whole)
+        rewrite(valid_set, change)
+        refused(valid_set)
+
+
+def test_a_general_policy_has_one_value_for_each_preference(valid_set) -> None:
+    """The same lines, read as those of a general policy."""
+    rewrite(valid_set, put(0, "general_policy", True))
+    assert "(2, 2), not (3, 2)" in refused(valid_set)
+
+
 def test_a_real_record_reads(tiny_run) -> None:
     record = read_record(str(tiny_run.path))
     assert record.error is None
+    assert record.general_policy is True
     assert record.config == tiny_run.lines[0]["config"]
     assert asdict(record)["start"] == tiny_run.lines[0]
     np.testing.assert_allclose(record.final_values, tiny_run.result.front.values)
@@ -536,7 +703,7 @@ def test_a_record_without_an_end_is_not_finished(valid) -> None:
     lines = valid.read_bytes().splitlines(keepends=True)
     valid.write_bytes(b"".join(lines[:-1]))
     record = read_record(valid)
-    assert record.error is not None
+    assert record.error == UNENDED
     assert record.final_values is None
     assert len(record.evaluations) == 2
 
@@ -549,8 +716,21 @@ def test_a_line_that_was_cut_off_while_it_was_written_is_ignored(valid) -> None:
         for cut in [start, start + 1, end - 2, *rng.integers(start, end - 1, 10)]:
             valid.write_bytes(whole[:cut])
             record = read_record(valid)
-            assert record.error is not None
+            assert record.error == UNENDED
             assert len(record.evaluations) == n_evaluations
+
+
+def test_whether_a_record_is_cut_off_at_its_start(valid) -> None:
+    """Not even the first line is whole, to the end of which a line break belongs."""
+    whole = valid.read_bytes()
+    first = whole.index(b"\n")
+    for cut in (0, 1, first // 2, first):
+        valid.write_bytes(whole[:cut])
+        assert is_cut_off_at_its_start(valid), cut
+    for cut in (first + 1, first + 2, len(whole)):
+        valid.write_bytes(whole[:cut])
+        assert not is_cut_off_at_its_start(valid), cut
+        read_record(valid)
 
 
 def refused(path: Path) -> str:
@@ -608,7 +788,8 @@ BAD_VALUES = {
     "another format": put(0, "format", "sb3_momba.front"),
     "no format": lambda events: events[0].pop("format"),
     "no start": lambda events: events.pop(0),
-    "two starts": lambda events: events.append(events[0]),
+    "two starts": lambda events: events.insert(1, events[0]),
+    "no general policy": lambda events: events[0].pop("general_policy"),
     "unknown event": put(2, "event", "intermezzo"),
     "no label": lambda events: events[0].pop("label"),
     "no seed": lambda events: events[0].pop("seed"),
@@ -627,6 +808,10 @@ BAD_VALUES = {
     "a value that is null": put(3, "values", [[1.0, None]] * 3),
     "a value that is a huge integer": put(3, "values", [[1.0, 10**400]] * 3),
     "an evaluation without steps": lambda events: events[3].pop("steps"),
+    "steps that stand still": put(4, "steps", 10),
+    "steps that fall": put(4, "steps", 9),
+    "the same evaluation twice": lambda events: events.insert(4, events[3]),
+    "evaluations in another order": lambda events: events.insert(3, events.pop(4)),
     "steps that are a huge integer": put(3, "steps", 10**400),
     "steps that are a list": put(3, "steps", [10]),
     "seconds that are words": put(3, "seconds", "soon"),
@@ -644,6 +829,28 @@ BAD_VALUES = {
 def test_what_does_not_fit_is_refused(valid, change: Callable[[list[dict[str, Any]]], Any]) -> None:
     rewrite(valid, change)
     refused(valid)
+
+
+def test_steps_that_do_not_rise_are_named(valid) -> None:
+    rewrite(valid, put(4, "steps", 9))
+    assert "from 10 steps to 9" in refused(valid)
+
+
+@pytest.mark.parametrize("failed", [False, True], ids=["finished", "failed"])
+@pytest.mark.parametrize("line", [0, 1, 3, 5], ids=["a start", "a floor", "an evaluation", "an end"])
+def test_nothing_comes_after_the_end(valid, failed: bool, line: int) -> None:
+    def go_on(events: list[dict[str, Any]]) -> None:
+        if failed:
+            events[-1] = {"event": "end", "status": "failed", "error": "RuntimeError: diverged"}
+        events.append({**events[line], **({"steps": 30} if line == 3 else {})})
+
+    rewrite(valid, go_on)
+    assert "goes on after its end" in refused(valid)
+
+
+def test_what_was_cut_off_after_the_end_is_ignored(valid) -> None:
+    valid.write_bytes(valid.read_bytes() + b'{"event": "evalu')
+    assert read_record(valid).error is None
 
 
 @pytest.mark.parametrize(
@@ -700,16 +907,27 @@ def reads_or_is_refused(path: Path) -> Record | None:
     except FileFormatError as error:
         assert str(path) in str(error)  # noqa: PT017
         return None
-    for values in [*(e.values for e in record.evaluations), *(floor.values for floor in record.floors)]:
-        assert values.shape == record.preferences.shape
+    final = [] if record.final_values is None else [record.final_values]
+    for values in [*(e.values for e in record.evaluations), *(floor.values for floor in record.floors), *final]:
+        assert values.ndim == 2
+        assert len(values) > 0
+        assert values.shape[1:] == record.reference_point.shape
+        assert values.shape == record.preferences.shape or not record.general_policy
         assert np.isfinite(values).all()
     assert (record.final_values is not None) == (record.error is None)
     assert np.isfinite(np.array([(e.steps, e.seconds) for e in record.evaluations], dtype=np.float64)).all()
+    assert (np.diff([e.steps for e in record.evaluations]) > 0).all()
     return record
 
 
-def test_damaged_bytes_are_read_or_refused(valid) -> None:
-    whole = valid.read_bytes()
+@pytest.fixture(params=["valid", "valid_set"], ids=["one policy", "a set of solutions"])
+def either(request) -> Path:
+    """A record with a general policy, and one without."""
+    return request.getfixturevalue(request.param)
+
+
+def test_damaged_bytes_are_read_or_refused(either) -> None:
+    whole = either.read_bytes()
     rng = np.random.default_rng(0)
     outcomes = set()
     for trial in range(300):
@@ -729,8 +947,8 @@ def test_damaged_bytes_are_read_or_refused(valid) -> None:
                 content[i:i] = content[i : min(j, i + 200)]
             if not content:
                 break
-        valid.write_bytes(bytes(content))
-        outcomes.add(reads_or_is_refused(valid) is None)
+        either.write_bytes(bytes(content))
+        outcomes.add(reads_or_is_refused(either) is None)
     assert outcomes == {True, False}
 
 
@@ -765,8 +983,8 @@ def places(x: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(value, (*here, key))
 
 
-def test_damaged_values_are_read_or_refused(valid) -> None:
-    events = [json.loads(line) for line in valid.read_text().splitlines()]
+def test_damaged_values_are_read_or_refused(either) -> None:
+    events = [json.loads(line) for line in either.read_text().splitlines()]
     everywhere = list(places(events))
     rng = np.random.default_rng(1)
     outcomes = set()
@@ -783,8 +1001,8 @@ def test_damaged_values_are_read_or_refused(valid) -> None:
             target.append(deepcopy(target[place[-1]]))
         else:
             target[place[-1]] = ODD_VALUES[rng.integers(len(ODD_VALUES))]
-        valid.write_text("".join(json.dumps(event) + "\n" for event in changed))
-        outcomes.add(reads_or_is_refused(valid) is None)
+        either.write_text("".join(json.dumps(event) + "\n" for event in changed))
+        outcomes.add(reads_or_is_refused(either) is None)
     assert outcomes == {True, False}
 
 

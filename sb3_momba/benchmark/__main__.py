@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             floors.main(given)
         else:
             speed.main(given)
-    except (ValueError, OSError, gym.error.Error) as error:
+    except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
 
 

@@ -20,7 +20,7 @@ from sb3_momba.envs.wrappers import make_env
 from sb3_momba.momba import parse_ent_coef
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
 from sb3_momba.train import RunSettings, parse, recorded_settings
-from sb3_momba.zoo.configuration import read_configuration
+from sb3_momba.zoo.configuration import check_hyperparameters, read_configuration
 
 logger = logging.getLogger(__name__)
 
@@ -75,12 +75,15 @@ def make_cells(
 def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2) -> int:
     """Run what has not ended yet; the number of runs that failed, now or before.
 
-    :raises ValueError: for a folder that holds something else, or where another grid runs, before anything runs
+    :raises ValueError: for unknown hyperparameters, a folder that holds something else or where another grid runs, before
+        anything runs
     :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
     if processes < 1:
         raise ValueError(f"processes={processes}: at least one is needed.")
     settings = {cell.name: parse(cell.arguments(output / cell.name)) for cell in cells}
+    for one in settings.values():
+        check_hyperparameters(one.policy, one.hyperparameters)
     for env, env_kwargs in {one.env: one.env_kwargs for one in settings.values()}.items():
         make_env(env, env_kwargs).close()
     output.mkdir(parents=True, exist_ok=True)
@@ -108,11 +111,9 @@ def has_to_run(folder: Path, settings: RunSettings) -> bool:
     :raises ValueError: if its folder holds anything but a run with these settings
     """
     record = folder / FILE_NAME
-    if not record.exists():
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not record.exists() or is_cut_off_at_its_start(record):
+        if folder.exists() and (not folder.is_dir() or any(file.name != FILE_NAME for file in folder.iterdir())):
             raise ValueError(f"{folder} holds something else than a run: choose another --output.")
-        return True
-    if is_cut_off_at_its_start(record):
         return True
     found, wanted = read_record(record), recorded_settings(settings)
     if found.config != wanted:

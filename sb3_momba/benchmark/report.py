@@ -38,6 +38,7 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
     :param baseline: the method whose IQM on each task is 1 in the aggregate over tasks
     :raises ValueError: for a baseline that no task has
     """
+    aggregate = "" if baseline is None else aggregate_table(tasks, baseline)
     folder.mkdir(parents=True, exist_ok=True)
     parts = ["# Report\n", EXPLANATION]
     unended = sum(record.error == UNENDED for record in records)
@@ -54,9 +55,7 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
             parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
         if draw_fronts(task, folder / f"front-{name}.png"):
             parts.append(f"![Fronts of the seeds of median hypervolume](front-{name}.png)\n")
-    if baseline is not None:
-        parts.append(aggregate_table(tasks, baseline))
-    parts += [comparison_table(tasks), failures(tasks), provenance(records)]
+    parts += [aggregate, comparison_table(tasks), failures(tasks), provenance(records)]
     text = "\n".join(part for part in parts if part)
     with atomic_write(folder / "report.md") as file:
         file.write(text.encode())

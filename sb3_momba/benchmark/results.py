@@ -143,10 +143,11 @@ def _score(record: Record, reference_point: Array, front: Array, floors: Sequenc
 
 
 def normalized_distance(values: Array, front: Array) -> float:
-    """IGD (4.3) on axes on which the front's range is [0, 1]; unknown where it has none."""
+    """IGD (4.3) on axes on which the front's range is [0, 1]; unknown where the front is a point."""
     if len(front) < 2:
         return np.nan
     nadir, span = front.min(axis=0), np.ptp(front, axis=0)
+    span = np.where(span > 0, span, 1)
     return inverted_generational_distance((values - nadir) / span, (front - nadir) / span)
 
 

@@ -248,7 +248,12 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
                 return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
             except TypeError:
                 pass
-        return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
+        try:
+            return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
+        except TypeError as error:
+            if not env_kwargs:
+                raise
+            raise ValueError(f"{env} cannot be made with env_kwargs={env_kwargs}: {error}.") from error
     if isinstance(env, gym.Env):
         if env_kwargs:
             raise ValueError("env_kwargs go with an id or a callable; this environment exists already.")
