@@ -8,7 +8,7 @@ import argparse
 import itertools
 import logging
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -117,12 +117,13 @@ class Task:
     n_episodes: int
     steps: int
     share: float  # of the exact hypervolume that a trained model must reach
+    settings: dict[str, Any] = field(default_factory=dict)  # of every model alike
 
 
 TASKS = {
     "bandit, 2 objectives": Task(QuadraticBandit, 2, 1, 5_000, 0.98),
     "bandit, 3 objectives": Task(lambda: QuadraticBandit(3), 3, 1, 10_000, 0.98),
-    "LQR": Task(LinearQuadraticRegulator, 2, 4, 10_000, 0.95),
+    "LQR": Task(LinearQuadraticRegulator, 2, 4, 10_000, 0.95, {"her": True}),
 }
 
 
@@ -150,6 +151,7 @@ def train_and_score(task_name: str, steps: int | None, seed: int, policy: str, c
         ent_coef="auto_0.01",
         policy_kwargs=SMALL_SIMBA if policy == "SimbaPolicy" else SMALL_MLP,
         seed=seed,
+        **task.settings,
     )
     model.learn(steps or task.steps)
     return score_policy(model, task)

@@ -20,9 +20,14 @@ EXPANSION = 4
 Normalization = Callable[[th.Tensor], th.Tensor]
 
 
+def l2_norm(x: th.Tensor) -> th.Tensor:
+    """Of the last dimension, which stays with length 1; at least EPS."""
+    return th.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(EPS)
+
+
 def l2_normalize(x: th.Tensor) -> th.Tensor:
     """Divide by the l2 norm of the last dimension: a point on the unit hypersphere."""
-    return x / th.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(EPS)
+    return x / l2_norm(x)
 
 
 def identity(x: th.Tensor) -> th.Tensor:
@@ -71,7 +76,7 @@ class HyperDense(nn.Module):
     @th.no_grad()
     def project(self) -> None:
         """W_i <- W_i / ||W_i||, one row i per output unit."""
-        self.weight.copy_(l2_normalize(self.weight))
+        self.weight.div_(l2_norm(self.weight))
 
 
 class Scaler(nn.Module):
