@@ -19,18 +19,11 @@ from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
-from sb3_momba.nn.products import PRECISIONS, fast_float32_products, product_dtype
+from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+from sb3_momba.settings import HER_DEFAULTS, check_settings
 
 MAX_SKIPPED_UPDATES = 20
-RANGES = {"gamma": (0, 1), "tau": (0, 1), "batch_size": (1, np.inf), "buffer_size": (1, np.inf)}
-CHOICES = {
-    "critic_loss": ("ce", "mse"),
-    "critic_minimum": ("scalarised", "objective"),
-    "critic_loss_reduction": ("sum", "mean"),
-    "precision": PRECISIONS,
-}
-
 Self = TypeVar("Self", bound="MOMBA")
 
 logger = logging.getLogger(__name__)
@@ -130,7 +123,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
             batch_size,
             tau,
             gamma,
-            train_freq,
+            tuple(train_freq) if isinstance(train_freq, list) else train_freq,  # type: ignore[arg-type]
             gradient_steps,
             action_noise,
             replay_buffer_class=replay_buffer_class or PreferenceReplayBuffer,
@@ -199,26 +192,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
                 f"train_freq={self.train_freq.frequency} episodes with n_envs={self.n_envs}: episodes end at different times; "
                 "count steps, or use one environment."
             )
-        if self.preference_alignment and not self.vector_values:
-            raise ValueError("preference_alignment=True needs the vector Q of eq. (3.21): set vector_values=True.")
-        if self.n_objectives == 1 and (self.her or self.preference_alignment):
-            raise ValueError("her and preference_alignment need two objectives or more: with one there is no preference.")
-        if self.her_kwargs is not None and not self.her:
-            raise ValueError(f"her_kwargs={self.her_kwargs} without her=True: set her=True, or leave them out.")
-        for name, (low, high) in RANGES.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name}={getattr(self, name)}: it must lie in [{low}, {high}].")
-        doubled = sorted(set(self.policy_kwargs) & set(self._injected_policy_kwargs()))
-        if doubled:
-            raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
-        for name, known in CHOICES.items():
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name}={getattr(self, name)!r} is not known: use one of {', '.join(known)}.")
-        if not issubclass(self.replay_buffer_class or PreferenceReplayBuffer, PreferenceReplayBuffer):
-            raise ValueError(
-                f"replay_buffer_class={self.replay_buffer_class}: it must be PreferenceReplayBuffer or a subclass, which "
-                "stores vector rewards and preferences."
-            )
+        check_settings(self)
 
     def _injected_policy_kwargs(self) -> dict[str, Any]:
         """What the policy must know of the algorithm; the user's `policy_kwargs` stay as they were given."""
@@ -231,7 +205,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         }
 
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:
-        relabelling = {"keep_probability": 0.2, "concentration": 5.0, **(self.her_kwargs or {})} if self.her else {}
+        relabelling = {**HER_DEFAULTS, **(self.her_kwargs or {})} if self.her else {}
         buffer_class: Any = self.replay_buffer_class or PreferenceReplayBuffer
         return buffer_class(
             self.buffer_size,

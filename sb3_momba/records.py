@@ -213,7 +213,7 @@ def read_record(path: str | os.PathLike[str]) -> Record:
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        raise FileFormatError(f"{path} is damaged, or no record: {type(error).__name__}: {error}.") from error
+        raise FileFormatError(f"{path} is damaged, or no record: {type(error).__name__}: {str(error).rstrip('.')}.") from error
 
 
 def _events(path: Path) -> Iterator[dict[str, Any]]:
@@ -224,7 +224,7 @@ def _events(path: Path) -> Iterator[dict[str, Any]]:
         except ValueError as error:
             if number == len(lines) and number > 1:
                 return  # The last line was cut off while it was written.
-            raise FileFormatError(f"line {number} is no JSON: {error}.") from error
+            raise FileFormatError(f"line {number} is no JSON: {str(error).rstrip('.')}.") from error
         if not isinstance(event, dict) or not isinstance(event.get("event"), str):
             raise FileFormatError(f"line {number} has no event.")
         yield event
@@ -236,8 +236,8 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         raise FileFormatError(f"it is no record: its first line must be a start of format {FORMAT!r}.")
     if type(start.get("version")) is not int or start["version"] != VERSION:
         raise FileFormatError(
-            f"it is a record of version {start.get('version')!r}, this sb3_momba reads version {VERSION}: it was written with "
-            f"{start.get('versions')}."
+            f"it is a record of version {start.get('version')!r}, this sb3_momba reads version {VERSION}: read it with the "
+            f"sb3_momba that wrote it, {_version_of(start)}."
         )
     reference_point = _numbers(start["reference_point"], "reference_point", (None,))
     preferences = _numbers(start["preferences"], "preferences", (None, len(reference_point)))
@@ -283,6 +283,11 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         final_values=final_values,
         error=error,
     )
+
+
+def _version_of(start: dict[str, Any]) -> str:
+    versions = start.get("versions")
+    return str(versions.get("sb3_momba")) if isinstance(versions, dict) else "of unknown version"
 
 
 def _finite(x: Any, name: str) -> float:

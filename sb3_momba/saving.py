@@ -22,6 +22,7 @@ from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.files import FileFormatError, FilePath, read_tree, register, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.policies import MombaPolicy
+from sb3_momba.settings import nearest
 from sb3_momba.system import library_versions
 
 FORMAT_VERSION = 1
@@ -121,6 +122,9 @@ class PickleFreeSaving(OffPolicyAlgorithm):
                 data["_last_obs"] = None
         model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg, arg-type]
         model.__dict__.update(data)
+        unknown = [name for name in kwargs if name not in model.__dict__]
+        if unknown:
+            raise ValueError(f"{cls.__name__} has no setting {unknown[0]!r}{nearest(unknown[0], model.__dict__)}")
         model.__dict__.update(kwargs)
         model._setup_model()
         if ("ent_coef_optimizer" in tree["params"]) != (model.ent_coef_optimizer is not None):

@@ -6,9 +6,10 @@ TensorBoard.
 """
 
 import argparse
+import contextlib
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,10 +26,11 @@ from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
-from sb3_momba.pareto.evaluation import ParetoFront
+from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.floors import evaluate_floors
 from sb3_momba.records import FILE_NAME as RECORD_NAME
 from sb3_momba.records import RecordWriter, plain
+from sb3_momba.settings import check_whole
 from sb3_momba.zoo.configuration import (
     Configuration,
     check_hyperparameters,
@@ -86,14 +88,28 @@ class RunResult:
     folder: Path
 
 
-def run(settings: RunSettings) -> RunResult:
-    """Train, evaluate and write the run's folder."""
+@dataclass
+class Prepared:
+    """A run that nothing speaks against."""
+
+    model: MOMBA
+    evaluation: ParetoEvalCallback
+    record: RecordWriter
+    preferences: np.ndarray
+    reference_point: Sequence[float]
+
+
+@contextlib.contextmanager
+def prepared(settings: RunSettings) -> Iterator[Prepared]:
+    """The model, with its environments open, and its evaluation. Nothing is written.
+
+    :raises ValueError: for settings that cannot be
+    """
     check_hyperparameters(settings.policy, settings.hyperparameters)
+    check_whole("steps", settings.steps, 1)
     folder = Path(settings.output)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
-    if settings.steps < 1:
-        raise ValueError(f"steps={settings.steps}: train for at least one step.")
     make_one = partial(make_env, settings.env, settings.env_kwargs)
     env = make_mo_vec_env(make_one, settings.n_envs, vec_env_cls=SubprocVecEnv if settings.subprocesses else DummyVecEnv)
     try:
@@ -114,11 +130,24 @@ def run(settings: RunSettings) -> RunResult:
         model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
         evaluation.check(model)
         preferences = preference_grid(model.n_objectives, settings.n_preferences)
-        # Nothing is written before this line, so that a run that is refused can be repeated.
-        with record.start(**description(settings, model, preferences, reference_point)):
+        yield Prepared(model, evaluation, record, preferences, reference_point)
+    finally:
+        env.close()
+
+
+def run(settings: RunSettings) -> RunResult:
+    """Train, evaluate and write the run's folder."""
+    with prepared(settings) as ready:
+        model, evaluation, folder = ready.model, ready.evaluation, Path(settings.output)
+        sizes = {
+            "actor": sum(p.numel() for p in model.actor.parameters()),
+            "critic": sum(p.numel() for p in model.critic.parameters()),
+        }
+        start = description(settings, ready.preferences, ready.reference_point, sizes)
+        with ready.record.start(**start) as record:
             floors = {}
-            for name, front in evaluate_floors(make_one, preferences, settings.n_episodes).items():
-                floors[name] = front.metrics(reference_point)
+            for name, front in evaluate_floors(evaluation.eval_env, ready.preferences, settings.n_episodes).items():
+                floors[name] = front.metrics(ready.reference_point)
                 record.append("floor", policy=name, **floors[name], values=front.values)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
             try:
@@ -127,13 +156,21 @@ def run(settings: RunSettings) -> RunResult:
                 model.save(folder / "model.zip")
             assert evaluation.front is not None
             record.finish(model.num_timesteps, vars(evaluation.front))
-    finally:
-        env.close()
     return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, floors, folder)
 
 
+def record_failure(settings: RunSettings, error: str) -> None:
+    """A record in the run's folder of a run that died before it could begin one."""
+    n_objectives = probe_environment(settings.env, settings.env_kwargs).n_objectives
+    reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives)
+    preferences = preference_grid(n_objectives, settings.n_preferences)
+    record = RecordWriter(Path(settings.output) / RECORD_NAME)
+    with contextlib.suppress(RuntimeError), record.start(**description(settings, preferences, reference_point, {})):
+        raise RuntimeError(error)
+
+
 def description(
-    settings: RunSettings, model: MOMBA, preferences: np.ndarray, reference_point: Sequence[float]
+    settings: RunSettings, preferences: np.ndarray, reference_point: Sequence[float], parameters: dict[str, int]
 ) -> dict[str, Any]:
     """The first line of a run's record."""
     return {
@@ -145,10 +182,7 @@ def description(
         "reference_point": reference_point,
         "preferences": preferences,
         "general_policy": True,
-        "parameters": {
-            "actor": sum(p.numel() for p in model.actor.parameters()),
-            "critic": sum(p.numel() for p in model.critic.parameters()),
-        },
+        "parameters": parameters,
     }
 
 
@@ -222,6 +256,11 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
 
     given = parser.parse_args(arguments)
     configuration = read_configuration(given.conf, given.env) if given.conf else Configuration("SimbaPolicy", {})
+    if given.conf and given.architecture and ARCHITECTURES[given.architecture] != configuration.policy:
+        raise ValueError(
+            f"--architecture {given.architecture}: the configuration {given.conf} is made for {configuration.policy}; leave "
+            "one of them out."
+        )
     hyperparameters = configuration.hyperparameters
     options = {
         "critic_loss": given.critic_loss,
@@ -280,7 +319,10 @@ def assign(values: dict[str, Any], assignment: str, option: str = "--set") -> No
         values = values.setdefault(parent, {})
         if not isinstance(values, dict):
             raise ValueError(f"{option} {assignment}: {parent} is {values!r}, which has no {key!r} inside.")
-    values[key] = literal(yaml.safe_load(text))
+    try:
+        values[key] = literal(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{option} {assignment}: {text!r} is no yaml literal.") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

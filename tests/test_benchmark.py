@@ -267,10 +267,22 @@ def test_the_worse_floor_is_that_of_each_score(fake) -> None:
 
 
 @pytest.mark.parametrize("error", [BAD, "cut off"], ids=["failed", "cut off"])
-def test_without_floors_the_utility_and_the_distance_of_a_run_that_failed_are_unknown(fake, error: Any) -> None:
+def test_a_run_that_failed_is_no_better_than_the_worst_that_is_known(fake, error: Any) -> None:
     task = only(compare([fake(FRONT, floors={}), fake(None, {10: FRONT}, error, floors={}, seed=1)]))
+    finished, failed = task.methods["a"]
+    assert failed.expected_utility == finished.expected_utility
+    assert failed.inverted_generational_distance == finished.inverted_generational_distance
+    assert np.isnan(failed.preference_regret)
+    worse_than_a_floor = [fake([[0.1, 0.1]] * len(PREFERENCES)), fake(None, error=error, seed=1)]
+    finished, failed = only(compare(worse_than_a_floor)).methods["a"]
+    assert failed.expected_utility == finished.expected_utility == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("error", [BAD, "cut off"], ids=["failed", "cut off"])
+def test_without_anything_known_the_scores_of_a_run_that_failed_are_unknown(fake, error: Any) -> None:
+    task = only(compare([fake(None, {10: FRONT}, error, floors={}, seed=1)]))
     assert task.floors == {}
-    failed = task.methods["a"][1]
+    failed = task.methods["a"][0]
     assert failed.hypervolume == 0
     assert np.isnan([failed.expected_utility, failed.inverted_generational_distance, failed.preference_regret]).all()
 
@@ -722,7 +734,9 @@ def test_a_report_without_floors_leaves_blank_what_is_unknown_of_a_run_that_fail
     text = report_of(tmp_path / "report", made)
     hypervolume, *others = rows_of(text, "a")[0][4:]
     assert hypervolume.startswith("3 [0, 6]")
-    assert others == ["2.667", "0", "0", ""]  # Those of the run that is known.
+    assert others == ["2.667", "0", "0", ""]  # The regret is that of the run that is known.
+    assert rows_of(text, "b")[0][4:] == ["0", "2.667", "", "0", ""]
+    text = report_of(tmp_path / "nothing", [fake(None, error=BAD, floors={}, label="b")])
     assert rows_of(text, "b")[0][4:] == ["0", "", "", "", ""]
 
 
@@ -825,8 +839,8 @@ def test_tasks_without_the_baseline_are_not_in_the_aggregate(fake, tmp_path) -> 
 
 def test_what_is_unknown_or_has_no_unit_is_blank_in_the_aggregate(fake, tmp_path) -> None:
     made = [fake(box(2.0), label="a", floors={}), fake(None, error=BAD, label="b", floors={})]
-    assert aggregate_of(report_of(tmp_path / "report", made, "a")) == {"a": ["1", "1", "1"], "b": ["1", "0", ""]}
-    assert aggregate_of(report_of(tmp_path / "other", made, "b")) == {"a": ["1", "", ""], "b": ["1", "", ""]}
+    assert aggregate_of(report_of(tmp_path / "report", made, "a")) == {"a": ["1", "1", "1"], "b": ["1", "0", "1"]}
+    assert aggregate_of(report_of(tmp_path / "other", made, "b")) == {"a": ["1", "", "1"], "b": ["1", "", "1"]}
 
 
 def test_a_baseline_that_nobody_has_is_an_error_that_names_who_is_there(fake, tmp_path) -> None:
@@ -968,11 +982,17 @@ def test_cells_are_every_configuration_environment_and_seed(tmp_path) -> None:
 
 def test_what_the_grid_says_wins_over_options(tmp_path) -> None:
     """Each cell has the place, the task and the seed that its name says."""
-    options = ["--seed", "7", "--env", "MO-Ant-v4", "--output", "/elsewhere", "--conf", "capql", "--steps", "3e4"]
+    options = ["--env", "MO-Ant-v4", "--conf", "capql", "--steps", "3e4"]
     for cell in make_cells(["momba"], [ENV], 2, options):
         settings = parsed(cell, tmp_path)
         assert (settings.env, settings.seed, settings.output) == (ENV, cell.seed, str(tmp_path))
         assert (settings.label, settings.steps) == ("momba", 30_000)
+
+
+@pytest.mark.parametrize("options", [["--seed", "7"], ["--seed=7"], ["--output", "/elsewhere"]])
+def test_options_that_each_cell_has_of_its_own_are_refused(options: list[str]) -> None:
+    with pytest.raises(ValueError, match=rf"{options[0].split('=')[0]} is the grid's own"):
+        make_cells(["momba"], [ENV], 2, options)
 
 
 def test_options_of_several_values_do_not_swallow_what_the_grid_says(tmp_path) -> None:
@@ -1104,15 +1124,15 @@ def test_a_second_grid_on_the_same_folder_is_refused_while_one_runs(training, tm
             run_grid(second, tmp_path / "grid")
         refusals.append(str(error.value))
         refusals.append(error_of("run", "--conf", "capql", "--env", ENV, "--seeds", "1", "--output", tmp_path / "grid"))
-        assert run_grid(second, tmp_path / "other") == 0
+        assert len(run_grid(second, tmp_path / "other")) == 0
         return fake_training(command, **kwargs)
 
     monkeypatch.setattr(subprocess, "run", run_meanwhile)
-    assert run_grid(first, tmp_path / "grid") == 0
+    assert len(run_grid(first, tmp_path / "grid")) == 0
     assert len(refusals) == 2
     assert all(f"Another grid runs in {tmp_path / 'grid'}" in refusal for refusal in refusals)
     assert not (tmp_path / "grid" / "capql").exists()
-    assert run_grid(second, tmp_path / "grid") == 0
+    assert len(run_grid(second, tmp_path / "grid")) == 0
     assert len(fake_training.seeds) == 3
 
 
@@ -1130,7 +1150,10 @@ def test_a_grid_that_was_killed_does_not_bar_the_next_one(training, tmp_path) ->
         with pytest.raises(ValueError, match="Another grid runs in"):
             run_grid(cells, tmp_path)
         other.kill()
-    assert run_grid(cells, tmp_path) == 0
+    assert len(run_grid(cells, tmp_path)) == 0
+
+
+REAL_RUN = subprocess.run
 
 
 class FakeTraining:
@@ -1142,6 +1165,8 @@ class FakeTraining:
         self.environments: list[dict[str, str]] = []
 
     def __call__(self, command: list[str], stdout: Any = None, env: Any = None, **kwargs: Any) -> SimpleNamespace:
+        if "sb3_momba.train" not in command:
+            return REAL_RUN(command, stdout=stdout, env=env, **kwargs)
         assert command[:3] == [sys.executable, "-m", "sb3_momba.train"]
         settings = train.parse(command[3:])
         self.seeds.append(settings.seed)
@@ -1174,20 +1199,24 @@ def training(monkeypatch) -> Callable[..., FakeTraining]:
 def test_what_ended_is_not_run_again_and_what_was_cut_off_is(training, tmp_path) -> None:
     cells = make_cells(["momba"], [ENV], 4)
     first = training({1: "fails", 2: "is cut off", 3: "does not start"})
-    assert run_grid(cells, tmp_path, processes=1) == 3
+    assert len(run_grid(cells, tmp_path, processes=1)) == 3
     assert sorted(first.seeds) == [0, 1, 2, 3]
     assert {environment["OMP_NUM_THREADS"] for environment in first.environments} == {"1"}
     failed = (tmp_path / cells[1].name / "record.jsonl").read_bytes()
 
     second = training()
-    assert run_grid(cells, tmp_path, processes=2) == 1
-    assert sorted(second.seeds) == [2, 3]
+    assert run_grid(cells, tmp_path, processes=2) == [cells[1].name, cells[3].name]
+    assert second.seeds == [2]
+    assert "it did not start: does not start" in str(read_record(tmp_path / cells[3].name / "record.jsonl").error)
     assert (tmp_path / cells[1].name / "record.jsonl").read_bytes() == failed
     assert read_record(tmp_path / cells[2].name / "record.jsonl").error is None
 
     third = training()
-    assert run_grid(cells, tmp_path) == 1
+    assert len(run_grid(cells, tmp_path)) == 2
     assert third.seeds == []
+    fourth = training()
+    assert run_grid(cells, tmp_path, retry_failed=True) == []
+    assert sorted(fourth.seeds) == [1, 3]
 
 
 def test_a_run_with_other_settings_is_not_taken_for_the_cells(training, tmp_path) -> None:
@@ -1205,7 +1234,7 @@ def test_a_run_that_was_cut_off_with_other_settings_is_not_thrown_away(training,
     run_grid([cell], tmp_path)
     path = tmp_path / cell.name / "record.jsonl"
     before = path.read_bytes()
-    with pytest.raises(ValueError, match=r"holds a run with other settings \(hyperparameters, steps\)"):
+    with pytest.raises(ValueError, match=r"holds a run with other settings \(hyperparameters\.gamma, steps\)"):
         run_grid(make_cells(["momba"], [ENV], 1, ["--set", "gamma=0.5"]), tmp_path)
     assert path.read_bytes() == before
 
@@ -1217,7 +1246,7 @@ def test_settings_that_no_result_depends_on_may_differ(training, tmp_path) -> No
     again = training()
     (cell,) = make_cells(["momba"], [ENV], 1, ["--eval-workers", "2"])
     assert parsed(cell, tmp_path).eval_workers == 2
-    assert run_grid([cell], tmp_path) == 0
+    assert len(run_grid([cell], tmp_path)) == 0
     assert again.seeds == []
     assert "eval_workers" not in read_record(tmp_path / cell.name / "record.jsonl").config
 
@@ -1255,7 +1284,7 @@ def test_a_run_that_was_cut_off_in_its_first_line_is_run_again(training, tmp_pat
     path.parent.mkdir(parents=True)
     path.write_bytes(content)
     fake_training = training()
-    assert run_grid([cell], tmp_path) == 0
+    assert len(run_grid([cell], tmp_path)) == 0
     assert fake_training.seeds == [0]
 
 

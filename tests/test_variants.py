@@ -274,7 +274,7 @@ def test_an_entry_of_the_environment_goes_before_the_default(tmp_path) -> None:
     path.write_text("default:\n  gamma: 0.9\nHop-v1:\n  gamma: 0.8\n  n_timesteps: !!float 2e4\n  train_freq: [1, 'episode']\n")
     assert read_configuration(str(path), "Run-v1").hyperparameters == {"gamma": 0.9}
     mine = read_configuration(str(path), "Hop-v1")
-    assert mine.hyperparameters == {"gamma": 0.8, "train_freq": (1, "episode")}
+    assert mine.hyperparameters == {"gamma": 0.8, "train_freq": [1, "episode"]}
     assert mine.n_timesteps == 20_000
 
 

@@ -13,14 +13,14 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sb3_momba.envs.wrappers import make_env
+from sb3_momba.benchmark.results import flat
 from sb3_momba.momba import parse_ent_coef
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
-from sb3_momba.train import RunSettings, parse, recorded_settings
-from sb3_momba.zoo.configuration import check_hyperparameters, read_configuration
+from sb3_momba.train import RunSettings, parse, prepared, record_failure, recorded_settings
+from sb3_momba.zoo.configuration import read_configuration
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +57,9 @@ def make_cells(
     :param auto_ent_coef: where configurations that learn alpha start it, all alike
     :raises ValueError: for a configuration that does not exist, or two of one name
     """
+    for option in ("--seed", "--output"):
+        if any(given.split("=")[0] == option for given in options):
+            raise ValueError(f"{option} is the grid's own for each run: give --seeds and the grid's --output.")
     if seeds < 1:
         raise ValueError(f"seeds={seeds}: at least one is needed.")
     cells: dict[str, Cell] = {}
@@ -72,26 +75,26 @@ def make_cells(
     return list(cells.values())
 
 
-def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2) -> int:
-    """Run what has not ended yet; the number of runs that failed, now or before.
+def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_failed: bool = False) -> list[str]:
+    """Run what has not ended yet; the names of the runs that failed, now or before.
 
-    :raises ValueError: for unknown hyperparameters, a folder that holds something else or where another grid runs, before
+    :param retry_failed: run again what failed
+    :raises ValueError: for settings that cannot be, a folder that holds something else or where another grid runs, before
         anything runs
     :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
     if processes < 1:
         raise ValueError(f"processes={processes}: at least one is needed.")
     settings = {cell.name: parse(cell.arguments(output / cell.name)) for cell in cells}
-    for one in settings.values():
-        check_hyperparameters(one.policy, one.hyperparameters)
-    for env, env_kwargs in {one.env: one.env_kwargs for one in settings.values()}.items():
-        make_env(env, env_kwargs).close()
+    for one in {(cell.conf, cell.env): settings[cell.name] for cell in cells}.values():
+        with prepared(replace(one, output=os.devnull + "/none")):
+            pass
     output.mkdir(parents=True, exist_ok=True)
     with alone_in(output):
-        waiting = [cell for cell in cells if has_to_run(output / cell.name, settings[cell.name])]
+        waiting = [cell for cell in cells if has_to_run(output / cell.name, settings[cell.name], retry_failed)]
         with ThreadPoolExecutor(processes) as pool:
-            list(pool.map(lambda cell: _run_cell(cell, output / cell.name), waiting))
-    return sum(outcome(output / cell.name) is not None for cell in cells)
+            list(pool.map(lambda cell: _run_cell(cell, settings[cell.name]), waiting))
+    return [cell.name for cell in cells if read_record(output / cell.name / FILE_NAME).error is not None]
 
 
 @contextlib.contextmanager
@@ -105,7 +108,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def has_to_run(folder: Path, settings: RunSettings) -> bool:
+def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) -> bool:
     """Whether a cell never ran or was cut off.
 
     :raises ValueError: if its folder holds anything but a run with these settings
@@ -117,32 +120,30 @@ def has_to_run(folder: Path, settings: RunSettings) -> bool:
         return True
     found, wanted = read_record(record), recorded_settings(settings)
     if found.config != wanted:
-        differing = sorted(name for name in {*wanted, *found.config} if wanted.get(name) != found.config.get(name))
+        theirs, ours = flat(found.config), flat(wanted)
+        differing = sorted(name for name in {*theirs, *ours} if theirs.get(name) != ours.get(name))
         raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
-    return found.error == UNENDED
+    return found.error == UNENDED or (retry_failed and found.error is not None)
 
 
-def _run_cell(cell: Cell, folder: Path) -> None:
+def _run_cell(cell: Cell, settings: RunSettings) -> None:
     logger.info("%s starts", cell.name)
+    folder = Path(settings.output)
     if folder.exists():
-        shutil.rmtree(folder)  # What was cut off; see `has_to_run`.
+        shutil.rmtree(folder)  # What was cut off or failed; see `has_to_run`.
     folder.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "sb3_momba.train", *cell.arguments(folder)]
     with open(log_of(folder), "wb") as log:
         # Runs side by side share the cores: one thread each.
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
-    error = outcome(folder)
-    logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
-
-
-def outcome(folder: Path) -> str | None:
-    """Why a run failed; None for one that finished."""
     record = folder / FILE_NAME
-    if record.exists() and not is_cut_off_at_its_start(record):
-        return read_record(record).error
-    said = log_of(folder).read_text(errors="replace").strip() if log_of(folder).exists() else ""
-    return f"it did not start: {said.splitlines()[-1] if said else 'no output'}"
+    if not record.exists() or is_cut_off_at_its_start(record):
+        record.unlink(missing_ok=True)
+        said = log_of(folder).read_text(errors="replace").split("\n")
+        record_failure(settings, f"it did not start: {next((line for line in reversed(said) if line.strip()), 'no output')}")
+    error = read_record(record).error
+    logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
 
 
 def log_of(folder: Path) -> Path:
@@ -155,6 +156,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, required=True, help="how many; they are 0, 1, ...")
     parser.add_argument("--output", type=Path, required=True, help="folder of the run folders")
     parser.add_argument("--processes", type=int, default=2, help="runs side by side, one thread each")
+    parser.add_argument("--retry-failed", action="store_true", help="run again what failed")
     parser.add_argument(
         "--auto-ent-coef", type=float, help="where every configuration that learns alpha starts it; 0.01 below 200,000 steps"
     )
@@ -163,8 +165,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(given: argparse.Namespace, options: Sequence[str]) -> None:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
-    failed = run_grid(
-        make_cells(given.conf, given.env, given.seeds, options, given.auto_ent_coef), given.output, given.processes
-    )
+    cells = make_cells(given.conf, given.env, given.seeds, options, given.auto_ent_coef)
+    failed = run_grid(cells, given.output, given.processes, given.retry_failed)
     if failed:
-        sys.exit(f"error: {failed} runs failed; their logs lie beside their folders in {given.output}.")
+        names = ", ".join(failed)
+        sys.exit(f"error: {len(failed)} runs failed ({names}); their logs lie beside their folders in {given.output}.")

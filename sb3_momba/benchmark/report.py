@@ -26,9 +26,10 @@ COLUMNS = {
 EXPLANATION = """\
 IQM of the runs with its 95 % interval from a stratified bootstrap, which is too narrow where there are few seeds: of normal
 scores it covers the truth in 71 % of cases with 3 seeds, 89 % with 5, 95 % with 10. Runs: those that finished, of all. A run
-that failed or did not end counts with the hypervolume 0 and with the expected utility and the IGD of the worse floor; regret
-is of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all final solutions in this report (section
-4.4), so it changes with the records. The curve's mean is the area under it divided by its length.
+that failed or did not end counts with the hypervolume 0 and with the worst expected utility and IGD among the floors and the
+finished runs; regret is of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all final solutions in
+this report (section 4.4), so it changes with the records; there is none where the envelope is one point. The curve's mean is
+the area under it divided by its length.
 """
 
 

@@ -28,8 +28,8 @@ NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference
 class Run:
     """One run's scores.
 
-    A run that failed or did not end counts with the hypervolume 0 and with the expected utility and the distance of the worse
-    floor (unknown where no floor is recorded). Its regret is unknown: standing still regrets nothing.
+    A run that failed or did not end counts with the hypervolume 0 and with the worst expected utility and distance among the
+    floors and all finished runs. Its regret is unknown: standing still regrets nothing.
 
     :param curve: hypervolume at each of `steps`
     """
@@ -90,8 +90,10 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
         )
         for floor in max(records, key=lambda record: len(record.floors)).floors
     }
+    earned = [*floors.values()]
+    earned += [(0.0, expected_utility(values, preferences), normalized_distance(values, front)) for values in final]
     methods = {
-        method: [_score(record, reference, front, list(floors.values())) for record in its_records]
+        method: [_score(record, reference, front, earned) for record in its_records]
         for method, its_records in name_methods(records).items()
     }
     return Task(name, reference, front, floors, methods)
@@ -117,19 +119,20 @@ def _check_protocol(name: str, records: Sequence[Record]) -> None:
     for record in records[1:]:
         same = np.array_equal(record.preferences, first.preferences)
         if not same or record.config.get("n_episodes") != first.config.get("n_episodes"):
-            found = [f"{len(r.preferences)} x {r.config.get('n_episodes')} ({r.path})" for r in (first, record)]
+            what = "episodes" if same else "preferences"
             raise ValueError(
-                f"{name} was evaluated with different preferences or episodes, {' and '.join(found)}: report them apart."
+                f"{name} was evaluated with different {what} in {first.path} and {record.path}: report them apart."
             )
 
 
-def _score(record: Record, reference_point: Array, front: Array, floors: Sequence[tuple[float, float, float]]) -> Run:
+def _score(record: Record, reference_point: Array, front: Array, earned: Sequence[tuple[float, float, float]]) -> Run:
+    """:param earned: hypervolume, expected utility and distance of floors and finished runs"""
     steps = np.array([evaluation.steps for evaluation in record.evaluations], dtype=np.float64)
     curve = np.array([hypervolume(evaluation.values, reference_point) for evaluation in record.evaluations])
     values = record.final_values
     if values is None:
-        utility = min((utility for _, utility, _ in floors), default=np.nan)
-        distance = max((distance for _, _, distance in floors), default=np.nan)
+        utility = min((utility for _, utility, _ in earned), default=np.nan)
+        distance = max((distance for _, _, distance in earned), default=np.nan)
         return Run(record, 0.0, utility, np.nan, distance, steps, curve)
     return Run(
         record,
@@ -158,7 +161,7 @@ def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
         by_label[record.label].append(record)
     methods: dict[str, list[Record]] = defaultdict(list)
     for label in sorted(by_label):
-        settings = [_flat({k: v for k, v in r.config.items() if k not in NOT_THE_METHOD}) for r in by_label[label]]
+        settings = [flat({k: v for k, v in r.config.items() if k not in NOT_THE_METHOD}) for r in by_label[label]]
         names = sorted({name for one in settings for name in one})
         differing = [name for name in names if len({repr(one.get(name)) for one in settings}) > 1]
         for record, one in zip(by_label[label], settings, strict=True):
@@ -167,15 +170,15 @@ def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
     return dict(methods)
 
 
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """{"a": {"b": 1}} -> {"a.b": 1.0}: 1 and 1.0 are the same setting."""
-    flat: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, dict):
-            flat.update(_flat(value, f"{prefix}{name}."))
+            found.update(flat(value, f"{prefix}{name}."))
         else:
-            flat[f"{prefix}{name}"] = float(value) if type(value) is int else value
-    return flat
+            found[f"{prefix}{name}"] = float(value) if type(value) is int else value
+    return found
 
 
 def _as_text(value: Any) -> str:
@@ -185,9 +188,12 @@ def _as_text(value: Any) -> str:
 def curve_on(runs: Sequence[Run]) -> tuple[Array, Array]:
     """The hypervolume curves of one method's runs on common steps: (n,) and (n_runs, n).
 
-    After its last evaluation a run that failed has the hypervolume 0.
+    After its last evaluation a run that failed has the hypervolume 0, up to the steps that it was meant to have.
     """
     steps = max((run.steps for run in runs), key=lambda s: (s[-1] if len(s) else 0, len(s)))
+    planned = max((float(run.record.config.get("steps", 0)) for run in runs if not run.is_finished), default=0.0)
+    if len(steps) and planned > steps[-1]:
+        steps = np.append(steps, planned)
     curves = [
         np.interp(steps, run.steps, run.curve, right=None if run.is_finished else 0.0) if len(run.steps) else 0 * steps
         for run in runs

@@ -42,10 +42,10 @@ class PgmorlEnv(MujocoEnv, EzPickle):
     deterministic: ClassVar[bool] = True
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
 
-    def __init__(self, physics: str = "2020", **kwargs: Any):
+    def __init__(self, physics: str | int = "2020", **kwargs: Any):
         EzPickle.__init__(self, physics, **kwargs)
         check_physics(physics)
-        self.physics = physics
+        self.physics = str(physics)
         kwargs = {"default_camera_config": self.camera, **kwargs}
         MujocoEnv.__init__(self, self.model_file, self.frames_per_step, observation_space=None, **kwargs)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}

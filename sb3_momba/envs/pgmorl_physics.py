@@ -12,11 +12,11 @@ PHYSICS = ("2020", "current")
 INERTIAL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 
 
-def check_physics(physics: str) -> None:
+def check_physics(physics: str | int) -> None:
     """
     :raises ValueError: where physics is not one of PHYSICS
     """
-    if physics not in PHYSICS:
+    if str(physics) not in PHYSICS:
         raise ValueError(
             f"physics={physics!r} is not known: '2020' keeps the rules under which the published fronts were made, 'current' "
             "takes those of the installed MuJoCo."

@@ -129,7 +129,7 @@ def make_sampler(spec: PreferenceSampler | SamplerSpec, n_objectives: int) -> Pr
         else:
             raise ValueError(f"its name must be uniform, cone or fixed, not {name!r}")
     except (TypeError, KeyError, ValueError) as error:
-        raise ValueError(f"preference_sampler={spec!r} is not understood: {error}.") from error
+        raise ValueError(f"preference_sampler={spec!r} is not understood: {str(error).rstrip('.')}.") from error
     return PerStepSampler(sampler) if per_step else sampler
 
 

@@ -253,7 +253,7 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
         except TypeError as error:
             if not env_kwargs:
                 raise
-            raise ValueError(f"{env} cannot be made with env_kwargs={env_kwargs}: {error}.") from error
+            raise ValueError(f"{env} cannot be made with env_kwargs={env_kwargs}: {str(error).rstrip('.')}.") from error
     if isinstance(env, gym.Env):
         if env_kwargs:
             raise ValueError("env_kwargs go with an id or a callable; this environment exists already.")

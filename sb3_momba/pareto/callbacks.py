@@ -63,6 +63,8 @@ class ParetoEvalCallback(EventCallback):
         super().__init__(callback_after_eval, verbose=verbose)
         if eval_freq < 1:
             raise ValueError(f"eval_freq={eval_freq}: give the number of environment steps between evaluations.")
+        if n_workers < 1:
+            raise ValueError(f"n_workers={n_workers}: at least one process is needed.")
         self.eval_env = eval_env
         self.eval_freq = int(eval_freq)
         self.evaluation_kwargs: dict[str, Any] = {

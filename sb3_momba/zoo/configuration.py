@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Container
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,15 +11,12 @@ import yaml
 
 from sb3_momba.momba import MOMBA
 from sb3_momba.policies import MombaPolicy
+from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parameters, policy_parameters
 
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
 RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize")
 POLICIES = MOMBA.policy_aliases
 NOT_FOR_CONFIGURATIONS = {"self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model"}
-NOT_FOR_POLICY_KWARGS = {
-    *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
-    *("n_objectives", "critic_loss", "vector_values", "best_return_scale", "gamma"),
-}
 
 
 @dataclass
@@ -55,7 +51,8 @@ def read_configuration(name: str, env_id: str) -> Configuration:
     try:
         entries = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {error}") from error
+        said = " ".join(str(error).split())
+        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {said}") from error
     entry = entries.get(env_id, entries.get("default")) if isinstance(entries, dict) else None
     if not isinstance(entry, dict):
         raise ValueError(f"{name} has no entry {env_id!r} and no 'default'.")
@@ -64,8 +61,9 @@ def read_configuration(name: str, env_id: str) -> Configuration:
         raise ValueError(f"{name}: normalize must be false: the policy normalises observations and rewards itself.")
     policy = entry.pop("policy", "SimbaPolicy")
     n_timesteps, n_envs = entry.pop("n_timesteps", None), entry.pop("n_envs", 1)
-    if isinstance(entry.get("train_freq"), list):
-        entry["train_freq"] = tuple(entry["train_freq"])
+    for key, value in (("n_timesteps", n_timesteps), ("n_envs", n_envs)):
+        if value is not None:  # yaml's 1e6 is a float
+            check_whole(f"{name}: {key}", int(value) if isinstance(value, float) and value.is_integer() else value, 1)
     check_hyperparameters(policy, entry)
     return Configuration(policy, entry, None if n_timesteps is None else int(n_timesteps), n_envs)
 
@@ -89,17 +87,11 @@ def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
     """:raises ValueError: for names that MOMBA or the policy do not take, with the nearest that they do"""
     if policy not in POLICIES:
         raise ValueError(f"The policy {policy!r} is not known{nearest(policy, POLICIES)}")
-    known = parameters(MOMBA) - NOT_FOR_CONFIGURATIONS
-    policy_known = policy_parameters(policy)
+    known = [name for name in parameters(MOMBA) if name not in NOT_FOR_CONFIGURATIONS]
     for name in hyperparameters:
         if name not in known:
             raise ValueError(f"MOMBA has no hyperparameter {name!r}{nearest(name, [*known, *RUN_KEYS])}")
-    policy_kwargs = hyperparameters.get("policy_kwargs") or {}
-    if not isinstance(policy_kwargs, dict):
-        raise ValueError(f"policy_kwargs={policy_kwargs!r}: write a mapping; nothing is evaluated.")
-    for name in policy_kwargs:
-        if name not in policy_known:
-            raise ValueError(f"{policy} has no argument {name!r}{nearest(name, policy_known)}")
+    check_policy_kwargs(POLICIES[policy], hyperparameters.get("policy_kwargs") or {})
 
 
 def with_defaults(policy: str, hyperparameters: dict[str, Any]) -> dict[str, Any]:
@@ -109,7 +101,7 @@ def with_defaults(policy: str, hyperparameters: dict[str, Any]) -> dict[str, Any
         **defaults(MOMBA, NOT_FOR_CONFIGURATIONS),
         **hyperparameters,
         "policy_kwargs": {
-            **{name: value for name, value in policy_defaults.items() if name in policy_parameters(policy)},
+            **{name: value for name, value in policy_defaults.items() if name in policy_parameters(POLICIES[policy])},
             **(hyperparameters.get("policy_kwargs") or {}),
         },
     }
@@ -119,19 +111,3 @@ def defaults(cls: type, but: Container[str] = ()) -> dict[str, Any]:
     """The arguments of a constructor that have a default, with it."""
     arguments = inspect.signature(cls.__init__).parameters.values()  # type: ignore[misc]
     return {a.name: a.default for a in arguments if a.default is not inspect.Parameter.empty and a.name not in but}
-
-
-def policy_parameters(policy: str) -> set[str]:
-    """What `policy_kwargs` may hold."""
-    known = (parameters(POLICIES[policy]) | parameters(MombaPolicy)) - NOT_FOR_POLICY_KWARGS
-    return known - {"normalize_weights"} if policy == "MlpPolicy" else known
-
-
-def parameters(cls: type) -> set[str]:
-    return set(inspect.signature(cls.__init__).parameters)  # type: ignore[misc]
-
-
-def nearest(name: str, known: Any) -> str:
-    """ ": did you mean 'x'?", or a full stop."""
-    near = get_close_matches(str(name), list(known), 1, cutoff=0.5)
-    return f": did you mean {near[0]!r}?" if near else "."

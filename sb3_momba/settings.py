@@ -1,0 +1,162 @@
+"""What MOMBA's settings may be. Every check raises a ValueError that names the setting, its value and the cure."""
+
+import inspect
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+
+from sb3_momba.buffers import PreferenceReplayBuffer
+from sb3_momba.nn.products import PRECISIONS
+from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+
+SWITCHES = ("vector_values", "her", "preference_alignment", "deterministic_exploration", "optimize_memory_usage")
+WHOLE_NUMBERS = {"batch_size": 1, "buffer_size": 1, "learning_starts": 0, "n_steps": 1}  # and the least that they may be
+RANGES = {"gamma": (0, 1), "tau": (0, 1)}
+CHOICES = {
+    "critic_loss": ("ce", "mse"),
+    "critic_minimum": ("scalarised", "objective"),
+    "critic_loss_reduction": ("sum", "mean"),
+    "precision": PRECISIONS,
+}
+BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "seed")
+HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0}
+
+POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
+POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")
+INJECTED = ("n_objectives", "critic_loss", "vector_values", "best_return_scale", "gamma")
+NOT_FOR_USERS = {
+    *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
+    *INJECTED,
+}
+
+
+def check_settings(model: Any) -> None:
+    """:param model: a MOMBA, whose attributes are its constructor's arguments"""
+    settings = vars(model)
+    for name in SWITCHES:
+        check_switch(name, settings[name])
+    for name, least in WHOLE_NUMBERS.items():
+        check_whole(name, settings[name], least)
+    if settings["gradient_steps"] != -1:
+        check_whole("gradient_steps", settings["gradient_steps"], 0, "; -1 makes as many as steps were taken")
+    for name, (low, high) in RANGES.items():
+        if not is_number(settings[name]) or not low <= settings[name] <= high:
+            raise ValueError(f"{name}={settings[name]!r}: it must lie in [{low}, {high}].")
+    for name, known in CHOICES.items():
+        if settings[name] not in known:
+            raise ValueError(f"{name}={settings[name]!r} is not known: use one of {', '.join(known)}.")
+    rate, scale, entropy = settings["learning_rate"], settings["best_return_scale"], settings["target_entropy"]
+    if not callable(rate) and not (is_number(rate) and rate > 0):
+        raise ValueError(f"learning_rate={rate!r}: give a number above 0, or a function of the remaining progress.")
+    if scale is not None and not (is_number(scale) and scale > 0):
+        raise ValueError(f"best_return_scale={scale!r}: give a number above 0, or None to leave rewards as they are.")
+    if entropy != "auto" and not is_number(entropy):
+        raise ValueError(f'target_entropy={entropy!r}: give "auto" or a number of nats.')
+    _check_together(model, settings)
+    check_policy_kwargs(model.policy_class, settings["policy_kwargs"])
+
+
+def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
+    if model.preference_alignment and not model.vector_values:
+        raise ValueError("preference_alignment=True needs the vector Q of eq. (3.21): set vector_values=True.")
+    if model.critic_minimum == "objective" and not model.vector_values:
+        raise ValueError("critic_minimum='objective' needs a Q for each objective: set vector_values=True.")
+    if model.n_objectives == 1 and (model.her or model.preference_alignment):
+        raise ValueError("her and preference_alignment need two objectives or more: with one there is no preference.")
+    if model.her_kwargs is not None:
+        if not model.her:
+            raise ValueError(f"her_kwargs={model.her_kwargs} without her=True: set her=True, or leave them out.")
+        check_names("her_kwargs", model.her_kwargs, HER_DEFAULTS)
+        for name, value in model.her_kwargs.items():
+            if not is_number(value):
+                raise ValueError(f"her_kwargs={{{name!r}: {value!r}}}: give a number.")
+    buffer_class = settings["replay_buffer_class"]
+    if not isinstance(buffer_class, type) or not issubclass(buffer_class, PreferenceReplayBuffer):
+        raise ValueError(
+            f"replay_buffer_class={buffer_class!r}: it must be PreferenceReplayBuffer or a subclass, which stores vector "
+            "rewards and preferences."
+        )
+    if buffer_class is PreferenceReplayBuffer:
+        check_names("replay_buffer_kwargs", settings["replay_buffer_kwargs"], BUFFER_ARGUMENTS)
+
+
+def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
+    """Names and values for the shipped policies; a subclass may take what it likes."""
+    if not isinstance(policy_kwargs, dict):
+        raise ValueError(f"policy_kwargs={policy_kwargs!r}: write a mapping; nothing is evaluated.")
+    doubled = sorted(set(policy_kwargs) & set(INJECTED))
+    if doubled:
+        raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
+    if policy in (SimbaPolicy, MlpPolicy):
+        check_names("policy_kwargs", policy_kwargs, policy_parameters(policy), f"{policy.__name__} has no argument")
+    for name, value in policy_kwargs.items():
+        if name in POLICY_SWITCHES:
+            check_switch(f"policy_kwargs {name}", value)
+        if name in POLICY_SIZES:
+            check_whole(f"policy_kwargs {name}", value, 1)
+    if "n_atoms" in policy_kwargs:
+        check_whole("policy_kwargs n_atoms", policy_kwargs["n_atoms"], 2)
+    if "support" in policy_kwargs:
+        check_support(policy_kwargs["support"])
+    if policy_kwargs.get("net_arch") is not None:
+        check_net_arch(policy_kwargs["net_arch"])
+
+
+def check_support(support: Any) -> None:
+    ordered = np.ndim(support) == 1 and len(support) == 2 and all(map(is_number, support)) and support[0] < support[1]
+    if not ordered:
+        raise ValueError(f"policy_kwargs support={support!r}: give two numbers in rising order.")
+
+
+def check_net_arch(net_arch: Any) -> None:
+    parts = net_arch.values() if isinstance(net_arch, dict) and set(net_arch) == {"pi", "qf"} else [net_arch]
+    for widths in parts:
+        if not isinstance(widths, list | tuple) or not widths or not all(is_whole(width, 1) for width in widths):
+            raise ValueError(f"net_arch={net_arch!r}: give a list of widths such as [256, 256], or dict(pi=[...], qf=[...]).")
+
+
+def check_switch(name: str, value: Any) -> None:
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name}={value!r}: it is a switch, give True or False.")
+
+
+def check_whole(name: str, value: Any, least: int, otherwise: str = "") -> None:
+    if not is_whole(value, least):
+        raise ValueError(f"{name}={value!r}: it must be a whole number of at least {least}{otherwise}.")
+
+
+def check_names(name: str, given: Any, known: Iterable[str], message: str = "It has no") -> None:
+    known = list(known)
+    if not isinstance(given, dict):
+        raise ValueError(f"{name}={given!r}: give a dictionary with any of {', '.join(known)}.")
+    for key in given:
+        if key not in known:
+            raise ValueError(f"{name}: {message} {key!r}{nearest(key, known)}")
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(np.isfinite(float(value)))
+
+
+def is_whole(value: Any, least: int) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
+
+
+def policy_parameters(policy: type) -> list[str]:
+    """What `policy_kwargs` may hold."""
+    known = dict.fromkeys([*parameters(policy), *parameters(MombaPolicy)])
+    without = {*NOT_FOR_USERS, "normalize_weights"} if policy is MlpPolicy else NOT_FOR_USERS
+    return [name for name in known if name not in without]
+
+
+def parameters(cls: type) -> list[str]:
+    return list(inspect.signature(cls.__init__).parameters)  # type: ignore[misc]
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """ ": did you mean 'x'?", or a full stop."""
+    near = get_close_matches(str(name), list(known), 1, cutoff=0.5)
+    return f": did you mean {near[0]!r}?" if near else "."
