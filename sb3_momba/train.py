@@ -108,8 +108,6 @@ def prepared(settings: RunSettings) -> Iterator[Prepared]:
     check_hyperparameters(settings.policy, settings.hyperparameters)
     check_whole("steps", settings.steps, 1)
     folder = Path(settings.output)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
     make_one = partial(make_env, settings.env, settings.env_kwargs)
     env = make_mo_vec_env(make_one, settings.n_envs, vec_env_cls=SubprocVecEnv if settings.subprocesses else DummyVecEnv)
     try:
@@ -137,8 +135,11 @@ def prepared(settings: RunSettings) -> Iterator[Prepared]:
 
 def run(settings: RunSettings) -> RunResult:
     """Train, evaluate and write the run's folder."""
+    folder = Path(settings.output)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
     with prepared(settings) as ready:
-        model, evaluation, folder = ready.model, ready.evaluation, Path(settings.output)
+        model, evaluation = ready.model, ready.evaluation
         sizes = {
             "actor": sum(p.numel() for p in model.actor.parameters()),
             "critic": sum(p.numel() for p in model.critic.parameters()),
