@@ -50,9 +50,7 @@ def check_settings(model: Any) -> None:
             raise ValueError(f"{name}={settings[name]!r} is not known: use one of {', '.join(known)}.")
     rate, scale, entropy = settings["learning_rate"], settings["best_return_scale"], settings["target_entropy"]
     if not callable(rate) and not (is_number(rate) and rate >= 0):
-        raise ValueError(
-            f"learning_rate={rate!r}: give a number of at least 0, or a function of the remaining progress."
-        )
+        raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or a function of the remaining progress.")
     if scale is not None and not (is_number(scale) and scale > 0):
         raise ValueError(f"best_return_scale={scale!r}: give a number above 0, or None to leave rewards as they are.")
     if entropy != "auto" and not is_number(entropy):
