@@ -21,7 +21,7 @@ from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
-from sb3_momba.settings import HER_DEFAULTS, check_settings
+from sb3_momba.settings import HER_DEFAULTS, check_settings, parse_ent_coef
 
 MAX_SKIPPED_UPDATES = 20
 Self = TypeVar("Self", bound="MOMBA")
@@ -402,21 +402,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
         if self.ent_coef_optimizer is None:
             return ["policy", "actor.optimizer", "critic.optimizer"], []
         return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
-
-
-def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
-    """Whether alpha is learned, and where it starts: "auto" (from 1), "auto_0.2" (from 0.2), or a fixed number."""
-    text = str(ent_coef)
-    learned = text == "auto" or text.startswith("auto_")
-    try:
-        start = float(text.removeprefix("auto").removeprefix("_") or 1.0) if learned else float(text)
-        if start < 0 or (learned and start == 0) or not np.isfinite(start):
-            raise ValueError("out of range")
-    except ValueError as error:
-        raise ValueError(
-            f'ent_coef={ent_coef!r}: give "auto", "auto_0.2" (a start above 0), or a number that is not negative.'
-        ) from error
-    return learned, start
 
 
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:

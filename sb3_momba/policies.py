@@ -60,10 +60,6 @@ class MombaPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=True,
         )
-        if n_critics < 1:
-            raise ValueError(f"n_critics={n_critics}: at least one critic is needed.")
-        if n_atoms < 2 or not support[0] < support[1]:
-            raise ValueError(f"n_atoms={n_atoms}, support={support}: a support has at least 2 atoms, in rising order.")
         self.n_objectives = n_objectives
         self.preference_dim = preference_dim(n_objectives)
         self.observation_dim = int(observation_space.shape[0]) - self.preference_dim
@@ -188,8 +184,6 @@ class MlpPolicy(MombaPolicy):
         if net_arch is None:
             net_arch = [256, 256]
         arch = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "qf": net_arch}
-        if set(arch) != {"pi", "qf"}:
-            raise ValueError(f"net_arch={net_arch!r}: give a list of widths, or dict(pi=[...], qf=[...]).")
         super().__init__(
             observation_space,
             action_space,

@@ -118,6 +118,21 @@ def check_net_arch(net_arch: Any) -> None:
             raise ValueError(f"net_arch={net_arch!r}: give a list of widths such as [256, 256], or dict(pi=[...], qf=[...]).")
 
 
+def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
+    """Whether alpha is learned, and where it starts: "auto" (from 1), "auto_0.2" (from 0.2), or a fixed number."""
+    text = str(ent_coef)
+    learned = text == "auto" or text.startswith("auto_")
+    try:
+        start = float(text.removeprefix("auto").removeprefix("_") or 1.0) if learned else float(text)
+        if start < 0 or (learned and start == 0) or not np.isfinite(start):
+            raise ValueError("out of range")
+    except ValueError as error:
+        raise ValueError(
+            f'ent_coef={ent_coef!r}: give "auto", "auto_0.2" (a start above 0), or a number that is not negative.'
+        ) from error
+    return learned, start
+
+
 def check_switch(name: str, value: Any) -> None:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name}={value!r}: it is a switch, give True or False.")

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_momba.benchmark.results import flat
-from sb3_momba.momba import parse_ent_coef
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
+from sb3_momba.settings import parse_ent_coef
 from sb3_momba.train import RunSettings, parse, prepared, record_failure, recorded_settings
 from sb3_momba.zoo.configuration import read_configuration
 
