@@ -54,13 +54,13 @@ def copy_weights(theirs, ours: MOMBA) -> None:
     columns = critic_columns(ours)
     with th.no_grad():
         for layer, source in zip(actor_layers(ours), their_actor_layers(theirs), strict=True):
-            layer.weight.copy_(source.weight)
+            layer.weight.copy_(source.weight.T)
             layer.bias.copy_(source.bias)
         for critic, networks in ((ours.critic, theirs.q_nets), (ours.critic_target, theirs.target_q_nets)):
             for member, network in enumerate(networks):
                 sources = [module for module in network.net if isinstance(module, th.nn.Linear)]
                 for i, (layer, source) in enumerate(zip([*critic.trunk.layers, critic.head], sources, strict=True)):
-                    layer.weight[member].copy_(source.weight[:, columns] if i == 0 else source.weight)
+                    layer.weight[member].copy_((source.weight[:, columns] if i == 0 else source.weight).T)
                     layer.bias[member].copy_(source.bias)
 
 
@@ -101,7 +101,7 @@ def gradient_of(parameter: th.Tensor) -> th.Tensor:
 
 def assert_same_actors(theirs, ours: MOMBA, pick=value_of, rtol: float = 1e-5) -> None:
     for layer, source in zip(actor_layers(ours), their_actor_layers(theirs), strict=True):
-        assert_close(pick(layer.weight), pick(source.weight), rtol)
+        assert_close(pick(layer.weight).T, pick(source.weight), rtol)
         assert_close(pick(layer.bias), pick(source.bias), rtol)
 
 
@@ -110,7 +110,7 @@ def assert_same_critics(critic, networks, columns: list[int], pick=value_of, rto
         sources = [module for module in network.net if isinstance(module, th.nn.Linear)]
         for i, (layer, source) in enumerate(zip([*critic.trunk.layers, critic.head], sources, strict=True)):
             weight = pick(source.weight)[:, columns] if i == 0 else pick(source.weight)
-            assert_close(pick(layer.weight)[member], weight, rtol)
+            assert_close(pick(layer.weight)[member].T, weight, rtol)
             assert_close(pick(layer.bias)[member], pick(source.bias), rtol)
 
 
@@ -192,13 +192,13 @@ def test_the_plainest_configuration_has_sacs_losses_and_gradients() -> None:
     with th.no_grad():
         linear = [module for module in sac.actor.latent_pi if isinstance(module, th.nn.Linear)]
         for layer, source in zip(actor_layers(ours), [*linear, sac.actor.mu, sac.actor.log_std], strict=True):
-            layer.weight.copy_(source.weight)
+            layer.weight.copy_(source.weight.T)
             layer.bias.copy_(source.bias)
         for critic, source_critic in ((ours.critic, sac.critic), (ours.critic_target, sac.critic_target)):
             for member, network in enumerate(source_critic.q_networks):
                 sources = [module for module in network if isinstance(module, th.nn.Linear)]
                 for layer, source in zip([*critic.trunk.layers, critic.head], sources, strict=True):
-                    layer.weight[member].copy_(source.weight)
+                    layer.weight[member].copy_(source.weight.T)
                     layer.bias[member].copy_(source.bias)
     batch = batch_of(ours)
 
@@ -215,7 +215,7 @@ def test_the_plainest_configuration_has_sacs_losses_and_gradients() -> None:
     loss.backward()
     layers = [*ours.critic.trunk.layers, ours.critic.head]
     ours_flat = [
-        tensor for member in (0, 1) for layer in layers for tensor in (layer.weight.grad[member], layer.bias.grad[member])
+        tensor for member in (0, 1) for layer in layers for tensor in (layer.weight.grad[member].T, layer.bias.grad[member])
     ]
     for gradient, sac_gradient in zip(ours_flat, sac_gradients, strict=True):
         th.testing.assert_close(gradient, 2 * sac_gradient, rtol=1e-4, atol=1e-6)
@@ -230,4 +230,4 @@ def test_the_plainest_configuration_has_sacs_losses_and_gradients() -> None:
     th.testing.assert_close(loss, sac_loss, rtol=1e-5, atol=1e-6)
     gradients = th.autograd.grad(loss, [p for layer in actor_layers(ours) for p in (layer.weight, layer.bias)])
     for gradient, sac_gradient in zip(gradients, sac_gradients, strict=True):
-        th.testing.assert_close(gradient, sac_gradient, rtol=1e-4, atol=1e-6)
+        th.testing.assert_close(gradient.T if gradient.dim() == 2 else gradient, sac_gradient, rtol=1e-4, atol=1e-6)

@@ -883,7 +883,7 @@ def assert_same(actual: dict[str, th.Tensor], expected: dict[str, th.Tensor]) ->
 
 def unit_rows(parameters: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
     """Section 3.3's weight normalisation: linear layers only, scalers and biases stay."""
-    return {name: p / p.norm(dim=-1, keepdim=True) if name.endswith("weight") else p for name, p in parameters.items()}
+    return {name: p / p.norm(dim=-2, keepdim=True) if name.endswith("weight") else p for name, p in parameters.items()}
 
 
 def test_one_gradient_step_is_algorithm_1() -> None:
@@ -1007,4 +1007,4 @@ def test_a_loss_that_is_not_a_number_changes_nothing_of_its_network(nth_loss: in
         target = dict(model.critic_target.named_parameters())[name]
         th.testing.assert_close(target, old_target[name] + model.tau * (parameter - old_target[name]))
         if "dense" in name:
-            th.testing.assert_close(parameter.norm(dim=-1), th.ones(parameter.shape[:-1]))
+            th.testing.assert_close(parameter.norm(dim=-2), th.ones_like(parameter[..., 0, :]))

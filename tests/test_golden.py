@@ -59,10 +59,8 @@ def in_torch_layout(golden: dict[str, np.ndarray], group: str, network: nn.Modul
     tensors = {}
     for path, array in golden.items():
         if path.startswith(f"{group}/"):
-            jax_name = path.removeprefix(f"{group}/").removeprefix("VmapSimbaV2Critic_0/")
-            name = torch_name(jax_name)
-            # Kernels are (in, out) there. An ensemble's scalers have one more dimension of size 1 here.
-            array = array.swapaxes(-1, -2) if jax_name.endswith("kernel") else array
+            name = torch_name(path.removeprefix(f"{group}/").removeprefix("VmapSimbaV2Critic_0/"))
+            # An ensemble's scalers have one more dimension of size 1 here.
             tensors[name] = th.tensor(array.copy()).view(shapes[name]) if "scaler" in name else th.tensor(array.copy())
             assert tensors[name].shape == shapes[name], name
     return tensors

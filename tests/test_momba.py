@@ -198,10 +198,10 @@ def test_switches_do_what_they_say():
     largest = sum(0.99 ** (20 - t) * 10 * t for t in range(11, 21))
     assert on.policy.return_scale.factor == pytest.approx(6.0 / largest)
     np.testing.assert_array_equal(on.policy.normalize(observations)[:, 3:], observations[:, 3:])
-    rows = [module.weight for module in on.actor.modules() if type(module).__name__ == "HyperDense"]
-    assert len(rows) > 4
-    for weight in rows:
-        np.testing.assert_allclose(weight.detach().norm(dim=-1), 1, rtol=1e-5)
+    weights = [module.weight for module in on.actor.modules() if type(module).__name__ == "HyperDense"]
+    assert len(weights) > 4
+    for weight in weights:
+        np.testing.assert_allclose(weight.detach().norm(dim=-2), 1, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -42,10 +42,10 @@ def first_layer(network: th.nn.Module) -> th.nn.Module:
 
 
 def hide_preference_from_the_first_layer(model: MOMBA) -> None:
-    """Zero the columns of w in the layers that read the input: what still depends on w gets it further in."""
+    """Zero the weights of w in the layers that read the input: what still depends on w gets it further in."""
     n, d = model.policy.observation_dim, model.n_objectives
     for network in (model.actor, model.critic):
-        first_layer(network).weight.data[..., n : n + d] = 0
+        first_layer(network).weight.data[..., n : n + d, :] = 0
 
 
 def perturb_films(model: MOMBA) -> None:
@@ -108,9 +108,9 @@ def test_one_objective_has_nothing_to_condition_on() -> None:
 # ------------------------------------------------------------------------------------------------- normalisation, 4.3.3
 
 
-def row_norms(model: MOMBA) -> np.ndarray:
+def weight_norms(model: MOMBA) -> np.ndarray:
     layers = [m for network in (model.actor, model.critic) for m in network.modules() if isinstance(m, HyperDense)]
-    return np.concatenate([layer.weight.detach().norm(dim=-1).flatten().numpy() for layer in layers])
+    return np.concatenate([layer.weight.detach().norm(dim=-2).flatten().numpy() for layer in layers])
 
 
 def trained_with(**switches: bool) -> MOMBA:
@@ -122,15 +122,15 @@ def trained_with(**switches: bool) -> MOMBA:
 @pytest.mark.parametrize("on", [True, False])
 def test_weight_normalisation_keeps_unit_rows_and_nothing_else_does(on: bool) -> None:
     model = trained_with(normalize_weights=on)
-    assert np.allclose(row_norms(model), 1, atol=1e-6) == on
+    assert np.allclose(weight_norms(model), 1, atol=1e-6) == on
 
 
-def test_without_weight_normalisation_training_changes_row_norms() -> None:
+def test_without_weight_normalisation_training_changes_weight_norms() -> None:
     model = model_of(normalize_weights=False)
-    before = row_norms(model)
+    before = weight_norms(model)
     model.learning_starts = 20
     model.learn(40)
-    assert not np.allclose(row_norms(model), before, atol=1e-4)
+    assert not np.allclose(weight_norms(model), before, atol=1e-4)
 
 
 @pytest.mark.parametrize("on", [True, False])
@@ -157,7 +157,7 @@ def test_each_switch_leaves_the_other_two_alone() -> None:
         model = model_of(**{switch: False})
         same = all(th.equal(p, q) for p, q in zip(reference.policy.parameters(), model.policy.parameters(), strict=True))
         assert same == (switch != "normalize_weights")
-        assert (row_norms(model).max() - 1 < 1e-6) == (switch != "normalize_weights" or row_norms(model).max() - 1 < 1e-6)
+        assert (weight_norms(model).max() - 1 < 1e-6) == (switch != "normalize_weights" or weight_norms(model).max() - 1 < 1e-6)
         observations = observations_of(model)
         norms = model.critic.features(observations, th.zeros(len(observations), 2)).norm(dim=-1)
         assert th.allclose(norms, th.ones_like(norms), atol=1e-5) == (switch != "normalize_features")

@@ -41,33 +41,32 @@ def member_shape(n_members: int | None) -> tuple[int, ...]:
 
 
 def dense(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
-    """W x + b for one network, or for each member of an ensemble.
+    """x W + b for one network, or for each member of an ensemble.
 
     :param x: (batch, in), seen by every member alike, or (n_members, batch, in)
-    :param weight: (out, in) or (n_members, out, in)
+    :param weight: (in, out) or (n_members, in, out): laid out as the product makes its gradient, which is then not copied
     :param bias: (out,) or (n_members, out)
     :return: (batch, out) or (n_members, batch, out)
     """
     if weight.dim() == 2:
-        return F.linear(x, weight, bias)
+        return x @ weight if bias is None else th.addmm(bias, x, weight)
     x = x.expand(weight.shape[0], -1, -1)
-    if bias is None:
-        return th.bmm(x, weight.mT)
-    return th.baddbmm(bias.unsqueeze(1), x, weight.mT)
+    return th.bmm(x, weight) if bias is None else th.baddbmm(bias.unsqueeze(1), x, weight)
 
 
 def orthogonal_members_(weight: nn.Parameter) -> None:
-    """Fill (out, in), or each member of (n_members, out, in), with an orthogonal matrix."""
+    """Fill (in, out), or each member of (n_members, in, out), with an orthogonal matrix."""
     for matrix in weight.detach().view(-1, *weight.shape[-2:]):
-        nn.init.orthogonal_(matrix)
+        nn.init.orthogonal_(matrix.T)
 
 
 class HyperDense(nn.Module):
-    """W x without bias, whose rows `project` puts on the unit hypersphere (weight normalisation, section 3.3)."""
+    """x W without bias, whose columns, one per output unit, `project` puts on the unit hypersphere (weight normalisation,
+    section 3.3)."""
 
     def __init__(self, in_features: int, out_features: int, n_members: int | None = None):
         super().__init__()
-        self.weight = nn.Parameter(th.empty(*member_shape(n_members), out_features, in_features))
+        self.weight = nn.Parameter(th.empty(*member_shape(n_members), in_features, out_features))
         orthogonal_members_(self.weight)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
@@ -75,8 +74,9 @@ class HyperDense(nn.Module):
 
     @th.no_grad()
     def project(self) -> None:
-        """W_i <- W_i / ||W_i||, one row i per output unit."""
-        self.weight.div_(l2_norm(self.weight))
+        """W_i <- W_i / ||W_i|| for each output unit i."""
+        # Over columns this sum takes an eighth of `vector_norm`'s time.
+        self.weight.div_(self.weight.square().sum(dim=-2, keepdim=True).sqrt().clamp_min(EPS))
 
 
 class Scaler(nn.Module):
@@ -157,7 +157,7 @@ class Linear(nn.Module):
         super().__init__()
         layers = [nn.Linear(in_features, out_features) for _ in range(n_members or 1)]
         shape = member_shape(n_members)
-        self.weight = nn.Parameter(th.stack([x.weight.detach() for x in layers]).view(*shape, out_features, in_features))
+        self.weight = nn.Parameter(th.stack([x.weight.detach().T for x in layers]).view(*shape, in_features, out_features))
         self.bias = nn.Parameter(th.stack([x.bias.detach() for x in layers]).view(*shape, out_features))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
@@ -187,7 +187,7 @@ class Film(nn.Module):
 
 
 def project_weights(network: nn.Module) -> None:
-    """Put the rows of every SimbaV2 dense layer of a network back on the unit hypersphere (Algorithm 1)."""
+    """Put the weights of every SimbaV2 dense layer of a network back on the unit hypersphere (Algorithm 1)."""
     for module in network.modules():
         if isinstance(module, HyperDense):
             module.project()
