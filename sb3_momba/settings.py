@@ -10,9 +10,10 @@ import numpy as np
 
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.nn.products import PRECISIONS
+from sb3_momba.nn.speed import has_compiler
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 
-SWITCHES = ("vector_values", "her", "preference_alignment", "deterministic_exploration", "optimize_memory_usage")
+SWITCHES = ("vector_values", "her", "preference_alignment", "compile", "deterministic_exploration", "optimize_memory_usage")
 WHOLE_NUMBERS = {"batch_size": 1, "buffer_size": 1, "learning_starts": 0, "n_steps": 1}  # and the least that they may be
 RANGES = {"gamma": (0, 1), "tau": (0, 1)}
 CHOICES = {
@@ -73,6 +74,10 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
         for name, value in model.her_kwargs.items():
             if not is_number(value):
                 raise ValueError(f"her_kwargs={{{name!r}: {value!r}}}: give a number.")
+    if model.compile and not has_compiler():
+        raise ValueError(
+            "compile=True needs a C++ compiler, and there is none (g++, clang++, or CXX): install one, or leave it out."
+        )
     buffer_class = settings["replay_buffer_class"]
     if not isinstance(buffer_class, type) or not issubclass(buffer_class, PreferenceReplayBuffer):
         raise ValueError(

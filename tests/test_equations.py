@@ -100,12 +100,8 @@ class StubCritic:
     def __call__(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return self.outputs(observations, actions)
 
-    def features(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        self.arguments = observations, actions
-        return th.cat(self.arguments, dim=-1)
-
-    def values(self, features: th.Tensor) -> th.Tensor:
-        return self.outputs(*self.arguments)
+    def values_and_features(self, observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return self.outputs(observations, actions), th.cat([observations, actions], dim=-1)
 
 
 def only_for(outputs: th.Tensor, observations: th.Tensor, actions: th.Tensor) -> StubCritic:

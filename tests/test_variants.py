@@ -137,7 +137,7 @@ def test_without_weight_normalisation_training_changes_weight_norms() -> None:
 def test_feature_normalisation_puts_features_on_the_sphere(on: bool) -> None:
     model = model_of(normalize_features=on)
     observations = observations_of(model)
-    norms = model.critic.features(observations, th.zeros(len(observations), 2)).norm(dim=-1)
+    norms = model.critic.values_and_features(observations, th.zeros(len(observations), 2))[1].norm(dim=-1)
     assert th.allclose(norms, th.ones_like(norms), atol=1e-5) == on
 
 
@@ -159,7 +159,7 @@ def test_each_switch_leaves_the_other_two_alone() -> None:
         assert same == (switch != "normalize_weights")
         assert (weight_norms(model).max() - 1 < 1e-6) == (switch != "normalize_weights" or weight_norms(model).max() - 1 < 1e-6)
         observations = observations_of(model)
-        norms = model.critic.features(observations, th.zeros(len(observations), 2)).norm(dim=-1)
+        norms = model.critic.values_and_features(observations, th.zeros(len(observations), 2))[1].norm(dim=-1)
         assert th.allclose(norms, th.ones_like(norms), atol=1e-5) == (switch != "normalize_features")
 
 

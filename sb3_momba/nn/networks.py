@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_momba.nn.layers import Film, HyperEmbedder, HyperHead, HyperLerpBlock, Linear, identity, l2_normalize, orthogonal_
+from sb3_momba.nn.speed import compilable
 
 CONDITIONINGS = ("input", "all", "film", "film+all")
 
@@ -169,6 +170,7 @@ class Actor(nn.Module):
 
     optimizer: th.optim.Optimizer
     action_scale: th.Tensor | None
+    compiled = False
 
     def __init__(
         self,
@@ -186,6 +188,7 @@ class Actor(nn.Module):
         self.log_std_head = architecture.head(self.trunk.features_dim, action_dim, None)
         self.squash_log_std = architecture.log_std
 
+    @compilable
     def distribution(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before tanh, each (batch, action_dim)."""
         features = self.trunk(observations, observations[:, self.observation_dim :])
@@ -221,6 +224,7 @@ class Critic(nn.Module):
     """
 
     optimizer: th.optim.Optimizer
+    compiled = False
 
     def __init__(
         self,
@@ -238,14 +242,13 @@ class Critic(nn.Module):
         self.trunk = architecture.trunk(observation_dim + preference_dim + action_dim, preference_dim, n_critics)
         self.head = architecture.head(self.trunk.features_dim, n_values * n_atoms, n_critics)
 
-    def features(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """What the trunk makes of a state, a preference and an action: (n_critics, batch, features_dim)."""
-        return self.trunk(th.cat([observations, actions], dim=-1), observations[:, self.observation_dim :])
-
-    def values(self, features: th.Tensor) -> th.Tensor:
-        """Logits, or expected values where n_atoms is 1: (batch, n_critics, n_values, n_atoms)."""
-        return self.head(features).unflatten(-1, self.shape).transpose(0, 1)
+    @compilable
+    def values_and_features(self, observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Logits, or expected values where n_atoms is 1, (batch, n_critics, n_values, n_atoms); and what the trunk made of
+        state, preference and action, (n_critics, batch, features_dim)."""
+        features = self.trunk(th.cat([observations, actions], dim=-1), observations[:, self.observation_dim :])
+        return self.head(features).unflatten(-1, self.shape).transpose(0, 1), features
 
     def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Logits, or expected values where n_atoms is 1: (batch, n_critics, n_values, n_atoms)."""
-        return self.values(self.features(observations, actions))
+        return self.values_and_features(observations, actions)[0]
