@@ -108,6 +108,11 @@ class MombaPolicy(BasePolicy):
             project_weights(self.actor)
             project_weights(self.critic)
 
+    def set_training_mode(self, mode: bool) -> None:
+        """SB3's, which `predict` calls at every step; where nothing changes, no module is asked."""
+        if mode != self.training:
+            super().set_training_mode(mode)
+
     def save(self, path: str) -> None:
         """Policies are saved with their model, without pickle."""
         raise NotImplementedError("Save the model instead: model.save(path); MOMBA.load(path).policy brings the policy back.")

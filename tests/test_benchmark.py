@@ -20,7 +20,7 @@ import yaml
 from scipy.spatial import ConvexHull
 
 from sb3_momba import records, train
-from sb3_momba.benchmark import grid
+from sb3_momba.benchmark import grid, speed
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.grid import Cell, alone_in, has_to_run, make_cells, run_grid
 from sb3_momba.benchmark.report import median_run, write_report
@@ -1370,3 +1370,29 @@ def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
     text = (tmp_path / "grid" / "report.md").read_text()
     assert rows_of(text, "tiny")[0][1:3] == ["1/1", "100"]
     assert text in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------------------------------------- speed
+
+
+def test_speed_measures_the_parts_that_are_asked_for(capsys):
+    main(["speed", "memory"])
+    table = capsys.readouterr().out
+    assert "### Memory" in table
+    assert "### Updates" not in table
+    # MO-Hopper-v4: 11 observations twice, 3 actions, 2 rewards and 2 weights in float32, two flags of a byte or more.
+    gigabytes = float(re.search(r"MO-Hopper-v4 \| ([\d.]+)", table)[1])
+    assert gigabytes == pytest.approx(4 * (11 + 11 + 3 + 2 + 2) / 1e3, abs=0.02)
+
+
+def test_speed_counts_products_and_parameters():
+    model = speed.filled_model(policy_kwargs=TINY_SIMBA)
+    assert speed.products_of_an_update(model) > 0
+    seconds, parameters = speed.cost_of_update({"policy_kwargs": TINY_SIMBA})
+    assert parameters == sum(p.numel() for p in model.critic.parameters())
+    assert 0 < seconds < 5
+
+
+def test_a_mistyped_part_of_speed_is_named():
+    with pytest.raises(SystemExit, match="'update' is no part of the measurement"):
+        main(["speed", "update"])

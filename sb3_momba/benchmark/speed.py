@@ -4,19 +4,24 @@ products allow. Rates of different lines compare; they do not carry over to anot
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from matplotlib.figure import Figure
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_momba.benchmark.report import describe
 from sb3_momba.benchmark.tables import markdown
+from sb3_momba.envs.wrappers import make_mo_vec_env
 from sb3_momba.momba import MOMBA
 from sb3_momba.nn.products import fast_float32_products
+from sb3_momba.nn.speed import has_compiler
 from sb3_momba.pareto.evaluation import evaluate_front
 from sb3_momba.system import machine
 
@@ -30,6 +35,13 @@ SCALING: dict[str, list[dict[str, Any]]] = {
     "batch_size": [{"batch_size": size} for size in (64, 128, 256, 512)],
     "n_objectives": [{"n_objectives": n, "vector_values": vector} for vector in (False, True) for n in (1, 2, 3, 6, 10)],
 }
+LOOPS: list[dict[str, Any]] = [
+    {},
+    {"precision": "bfloat16"},
+    {"precision": "bfloat16", "compile": True},
+    *({"gradient_steps": n} for n in (2, 4, 8)),
+    *({"n_envs": n, "gradient_steps": -1} for n in (4, 16)),
+]
 
 
 class Blank(gym.Env[np.ndarray, np.ndarray]):
@@ -90,42 +102,78 @@ def product_rate(precision: str) -> float:
 
 
 def speed_table() -> str:
-    rows = [["precision", "updates/s", "products, GFLOP/update", "products, GFLOP/s", "limit, updates/s", "share of the limit"]]
+    """Updates per second beside the limit: the update's products at the rate of the largest of them alone."""
+    rows = [["update", "updates/s", "products, GFLOP/update", "products, GFLOP/s", "limit, updates/s", "share of the limit"]]
     for precision in DTYPES:
-        model = filled_model(precision=precision)
-        rate, operations, limit = updates_per_second(model), products_of_an_update(model), product_rate(precision)
-        allowed = limit / operations
-        numbers = [f"{rate:.1f}", f"{operations / 1e9:.2f}", f"{limit / 1e9:.0f}", f"{allowed:.1f}", f"{rate / allowed:.0%}"]
-        rows.append([precision, *numbers])
+        for compile in (False, True) if has_compiler() else (False,):
+            model = filled_model(precision=precision)
+            operations = products_of_an_update(model)
+            for network in (model.actor, model.critic, model.critic_target):
+                network.compiled = compile
+            rate, limit = updates_per_second(model), product_rate(precision)
+            allowed = limit / operations
+            numbers = [
+                f"{rate:.1f}",
+                f"{operations / 1e9:.2f}",
+                f"{limit / 1e9:.0f}",
+                f"{allowed:.1f}",
+                f"{rate / allowed:.0%}",
+            ]
+            rows.append([precision + (", compiled" if compile else ""), *numbers])
     capql = filled_model("MlpPolicy", batch_size=128, **CAPQL)
     rows.append(["CAPQL, float32, batch 128", f"{updates_per_second(capql):.1f}", "", "", "", ""])
     return markdown(rows)
 
 
-def scaling_table() -> str:
-    rows = [["setting", "updates/s", "critic parameters"]]
-    for settings in (one for several in SCALING.values() for one in several):
-        model = filled_model(**settings)
-        named = settings.get("policy_kwargs", settings)
-        parameters = sum(p.numel() for p in model.critic.parameters())
-        rows.append([describe(named), f"{updates_per_second(model, 5):.1f}", f"{parameters:,}"])
+def scaling_table(picture: Path | None = None) -> str:
+    """What an update costs with one setting changed, beside what the critics grow by.
+
+    :param picture: where to draw the same
+    """
+    rows = [["setting", "ms/update", "times the default's", "critic parameters", "times the default's"]]
+    default, default_parameters = cost_of_update({})
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    for axes, (name, several) in zip(figure.subplots(1, len(SCALING), sharey=True), SCALING.items(), strict=True):
+        lines: dict[str, list[tuple[float, float]]] = {}
+        for settings in several:
+            seconds, parameters = cost_of_update(settings)
+            times, size = seconds / default, parameters / default_parameters
+            cells = [f"{1e3 * seconds:.1f}", f"{times:.2f}", f"{parameters:,}", f"{size:.2f}"]
+            rows.append([describe(settings.get("policy_kwargs", settings)), *cells])
+            value = {**settings, **settings.get("policy_kwargs", {})}[name]
+            lines.setdefault("vector" if settings.get("vector_values") else "scalarised", []).append((value, times))
+        for label, points in lines.items():
+            axes.plot(*zip(*points, strict=True), marker="o", label=f"{label} critic")
+        axes.set(xlabel=name, xscale="log")
+        axes.legend()
+    if picture is not None:
+        figure.supylabel("time of an update / the default's")
+        figure.savefig(picture, dpi=120)
     return markdown(rows)
+
+
+def cost_of_update(settings: dict[str, Any]) -> tuple[float, int]:
+    """Seconds, and the critics' parameters."""
+    model = filled_model(**settings)
+    return 1 / updates_per_second(model, 5), sum(p.numel() for p in model.critic.parameters())
 
 
 def loop_table(steps: int = 300) -> str:
     """Environment steps per second of `learn`, updates included, and the share of what is not an update."""
-    rows = [["task", "setting", "env steps/s in learn", "not in updates"]]
-    variants: list[dict[str, Any]] = [{}, {"precision": "bfloat16"}, {"gradient_steps": 2}, {"gradient_steps": 4}]
-    for settings in variants:
-        model = MOMBA("SimbaPolicy", TASK, seed=0, learning_starts=300, buffer_size=2_000, **settings)
-        model.learn(310)
-        in_updates = Stopwatch(model.train)
+    rows = [["setting", "env steps/s", "updates/s", "not in updates"]]
+    for settings in LOOPS:
+        n_envs = settings.get("n_envs", 1)
+        env = make_mo_vec_env(TASK, n_envs)
+        others = {name: value for name, value in settings.items() if name != "n_envs"}
+        model = MOMBA("SimbaPolicy", env, seed=0, learning_starts=300, buffer_size=2_000, **others)
+        model.learn(300 + 10 * n_envs)
+        in_updates, updates = Stopwatch(model.train), model._n_updates
         model.train = in_updates  # type: ignore[method-assign,assignment]
         started = time.perf_counter()
         model.learn(steps, reset_num_timesteps=False)
         seconds = time.perf_counter() - started
-        share = 1 - in_updates.seconds / seconds
-        rows.append([TASK, describe(settings) or "default", f"{steps / seconds:.1f}", f"{share:.1%}"])
+        rates = [f"{steps / seconds:.1f}", f"{(model._n_updates - updates) / seconds:.1f}"]
+        rows.append([describe(settings) or "default", *rates, f"{1 - in_updates.seconds / seconds:.1%}"])
     return markdown(rows)
 
 
@@ -144,13 +192,13 @@ class Stopwatch:
 
 
 def evaluation_table(n_preferences: int = 100, n_episodes: int = 5, cores: int = 2) -> str:
-    """Seconds of an evaluation, beside those of a loop that predicts one action at a time."""
+    """Seconds of an evaluation, every episode run, beside those of a loop that predicts one action at a time."""
     model = MOMBA("SimbaPolicy", EVALUATION_TASK, seed=0, buffer_size=10)
     rows = [["way", "seconds"]]
     for n_workers in range(1, cores + 1):
-        evaluate_front(model, EVALUATION_TASK, n_preferences=2, n_workers=n_workers)  # The workers' first start is apart.
+        evaluate_front(model, all_episodes, n_preferences=2, n_workers=n_workers)  # The workers' first start is apart.
         started = time.perf_counter()
-        front = evaluate_front(model, EVALUATION_TASK, n_preferences, n_episodes, n_workers=n_workers)
+        front = evaluate_front(model, all_episodes, n_preferences, n_episodes, n_workers=n_workers)
         rows.append([f"evaluate_front, n_workers={n_workers}", f"{time.perf_counter() - started:.1f}"])
     env = gym.make(EVALUATION_TASK)
     started, steps, n_tried = time.perf_counter(), 0, 4
@@ -162,9 +210,16 @@ def evaluation_table(n_preferences: int = 100, n_episodes: int = 5, cores: int =
             observation, _, terminated, truncated, _ = env.step(action)
             done, steps = terminated or truncated, steps + 1
     per_step = (time.perf_counter() - started) / steps
-    total = per_step * float(front.episode_lengths.sum()) * n_episodes / front.episode_lengths.shape[1]
+    total = per_step * float(front.episode_lengths.sum())
     rows.append([f"predict in a loop, {n_episodes} episodes each (from {n_tried} episodes)", f"{total:.0f}"])
     return markdown(rows)
+
+
+def all_episodes() -> gym.Env[Any, Any]:
+    """The task without the knowledge that one of its episodes stands for all."""
+    env = gym.make(EVALUATION_TASK)
+    env.unwrapped.deterministic = False  # type: ignore[attr-defined]
+    return env
 
 
 def memory_table(size: int = 1_000_000) -> str:
@@ -177,31 +232,33 @@ def memory_table(size: int = 1_000_000) -> str:
     return markdown(rows)
 
 
-PARTS: dict[str, Callable[[], str]] = {
-    "updates": speed_table,
-    "loop": loop_table,
-    "scaling": scaling_table,
-    "evaluation": evaluation_table,
-    "memory": memory_table,
-}
+PARTS = ("updates", "loop", "scaling", "evaluation", "memory")
 
 
-def tables(parts: list[str]) -> Iterator[str]:
+def tables(parts: Sequence[str], picture: Path | None = None) -> Iterator[str]:
+    makers: dict[str, Callable[[], str]] = {
+        "updates": speed_table,
+        "loop": loop_table,
+        "scaling": partial(scaling_table, picture),
+        "evaluation": evaluation_table,
+        "memory": memory_table,
+    }
     yield f"{describe(machine())}\n"
     for part in parts:
-        yield f"### {part.capitalize()}\n\n{PARTS[part]()}"
+        yield f"### {part.capitalize()}\n\n{makers[part]()}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; by default all")
     parser.add_argument("--threads", type=int, help="of torch; by default its own choice")
+    parser.add_argument("--picture", type=Path, help="file for a picture of the scaling")
 
 
 def main(given: argparse.Namespace) -> None:
     unknown = [part for part in given.parts if part not in PARTS]
     if unknown:
-        raise ValueError(f"{unknown[0]!r} is no part of the measurement: choose of {', '.join(PARTS)}.")
+        raise ValueError(f"{unknown[0]!r} is no part of the measurement: choose from {', '.join(PARTS)}.")
     if given.threads is not None:
         th.set_num_threads(given.threads)
-    for table in tables(given.parts or list(PARTS)):
+    for table in tables(given.parts or PARTS, given.picture):
         print(table, flush=True)
