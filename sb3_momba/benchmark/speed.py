@@ -158,21 +158,22 @@ def cost_of_update(settings: dict[str, Any]) -> tuple[float, int]:
     return 1 / updates_per_second(model, 5), sum(p.numel() for p in model.critic.parameters())
 
 
-def loop_table(steps: int = 300) -> str:
+def loop_table(updates: int = 320) -> str:
     """Environment steps per second of `learn`, updates included, and the share of what is not an update."""
     rows = [["setting", "env steps/s", "updates/s", "not in updates"]]
     for settings in LOOPS:
         n_envs = settings.get("n_envs", 1)
         env = make_mo_vec_env(TASK, n_envs)
         others = {name: value for name, value in settings.items() if name != "n_envs"}
+        steps = updates // max(settings.get("gradient_steps", 1), 1)
         model = MOMBA("SimbaPolicy", env, seed=0, learning_starts=300, buffer_size=2_000, **others)
         model.learn(300 + 10 * n_envs)
-        in_updates, updates = Stopwatch(model.train), model._n_updates
+        in_updates, before = Stopwatch(model.train), model._n_updates
         model.train = in_updates  # type: ignore[method-assign,assignment]
         started = time.perf_counter()
         model.learn(steps, reset_num_timesteps=False)
         seconds = time.perf_counter() - started
-        rates = [f"{steps / seconds:.1f}", f"{(model._n_updates - updates) / seconds:.1f}"]
+        rates = [f"{steps / seconds:.1f}", f"{(model._n_updates - before) / seconds:.1f}"]
         rows.append([describe(settings) or "default", *rates, f"{1 - in_updates.seconds / seconds:.1%}"])
     return markdown(rows)
 
