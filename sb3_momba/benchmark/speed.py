@@ -145,6 +145,9 @@ def scaling_table(picture: Path | None = None) -> str:
         for label, points in lines.items():
             axes.plot(*zip(*points, strict=True), marker="o", label=f"{label} critic")
         axes.set(xlabel=name, xscale="log")
+        values = [value for value, _ in points]
+        axes.set_xticks(values, [str(value) for value in values])
+        axes.minorticks_off()
         axes.legend()
     if picture is not None:
         figure.supylabel("time of an update / the default's")
