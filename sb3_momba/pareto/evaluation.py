@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -137,7 +138,8 @@ def evaluate_front(
         raise ValueError("preferences has no rows: give at least one preference.")
     grid = check_preference(grid, probe.n_objectives).astype(np.float64)
     n_run = 1 if probe.deterministic and deterministic else n_episodes
-    jobs = [(w, int(seed) + episode) for w in grid for episode in range(n_run)]
+    each = [(w, int(seed) + episode) for w in grid for episode in range(n_run)]
+    jobs = [(number, w, one_seed) for number, (w, one_seed) in enumerate(each)]
 
     if n_workers == 1:
         returns, discounted, lengths = _run_jobs(model, env, env_kwargs, jobs, gamma, deterministic)
@@ -163,7 +165,7 @@ def evaluate_front(
     return ParetoFront(grid, returns.reshape(*shape, -1), discounted.reshape(*shape, -1), lengths.reshape(shape), settings)
 
 
-Jobs = Sequence[tuple[np.ndarray, int]]
+Jobs = Sequence[tuple[int, np.ndarray, int]]  # number among all jobs, preference, seed
 Measured = tuple[Array, Array, NDArray[np.int64]]
 
 
@@ -194,7 +196,7 @@ def _run_jobs(
     # Sampling actions must not disturb the random numbers of a training that is going on.
     with th.random.fork_rng(enabled=not deterministic):
         if not deterministic:
-            th.manual_seed(jobs[0][1])
+            th.manual_seed(jobs[0][2])
         try:
             th.set_num_threads(1)  # More of them only slow such small products down, and could round them differently.
             return _run_episodes(model, venv, jobs, gamma, deterministic)
@@ -206,7 +208,7 @@ def _run_jobs(
 
 def _run_episodes(model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, deterministic: bool) -> Measured:
     """Each environment takes the next (preference, seed) as soon as its episode ends; idle ones go on unheard."""
-    n_objectives = jobs[0][0].size
+    n_objectives = jobs[0][1].size
     returns, discounted = np.zeros((2, len(jobs), n_objectives))
     lengths = np.zeros(len(jobs), dtype=np.int64)
     observations = np.array(venv.reset())
@@ -217,14 +219,15 @@ def _run_episodes(model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, dete
         job = next(waiting, None)
         job_of[index] = None if job is None else job[0]
         if job is not None:
-            w, seed = job[1]
+            _, w, seed = job[1]
             options = {"preference": w} if n_objectives > 1 else None
             observations[index] = venv.env_method("reset", seed=seed, options=options, indices=[index])[0][0]
 
     for index in range(venv.num_envs):
         start_next(index)
     while any(job is not None for job in job_of):
-        next_observations, scalars, dones, infos = venv.step(_predict(model, observations, deterministic))
+        places = [None if job is None else jobs[job][0] for job in job_of]
+        next_observations, scalars, dones, infos = venv.step(_predict(model, observations, places, deterministic))
         observations = np.array(next_observations)
         for index, job in enumerate(job_of):
             if job is None:
@@ -238,15 +241,27 @@ def _run_episodes(model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, dete
     return returns, discounted, lengths
 
 
-def _predict(model: Predictor, observations: np.ndarray, deterministic: bool) -> np.ndarray:
-    """Actions of any number of observations, of a network in batches of one shape: products round differently with it."""
+def _predict(model: Predictor, observations: np.ndarray, places: Sequence[int | None], deterministic: bool) -> np.ndarray:
+    """Actions, of a network in batches of one shape with each job in a place of its own: products round differently with
+    both.
+
+    :param places: the number of each observation's job; None where nobody listens
+    """
     if not isinstance(model, BaseAlgorithm | BasePolicy):
         return model.predict(observations, deterministic=deterministic)[0]
-    n = len(observations)
-    n_batches = -(-n // BATCH)
-    padded = observations[np.minimum(np.arange(n_batches * BATCH), n - 1)]
-    batches = [model.predict(batch, deterministic=deterministic)[0] for batch in np.split(padded, n_batches)]
-    return np.concatenate(batches)[:n]
+    space = model.action_space
+    assert isinstance(space, spaces.Box)
+    actions = np.tile((space.low + space.high) / 2, (len(observations), 1))
+    blocks: dict[int, list[tuple[int, int]]] = {}
+    for index, place in enumerate(places):
+        if place is not None:
+            blocks.setdefault(place // BATCH, []).append((index, place % BATCH))
+    for block in blocks.values():
+        indices, rows = (list(column) for column in zip(*block, strict=True))
+        batch = np.tile(observations[indices[0]], (BATCH, 1))
+        batch[rows] = observations[indices]
+        actions[indices] = model.predict(batch, deterministic=deterministic)[0][rows]
+    return actions
 
 
 @dataclass
