@@ -4,6 +4,7 @@ __version__ = "0.1.0"
 
 import sb3_momba.envs.pgmorl  # noqa: F401  registers the tasks of the thesis
 from sb3_momba.buffers import PreferenceReplayBuffer
+from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.envs.wrappers import PreferenceWrapper, make_mo_vec_env
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto.callbacks import ParetoEvalCallback
@@ -15,6 +16,7 @@ from sb3_momba.policies import MlpPolicy, SimbaPolicy
 __all__ = [
     "MOMBA",
     "MlpPolicy",
+    "MombaCheckpointCallback",
     "ParetoEvalCallback",
     "ParetoFront",
     "PreferenceReplayBuffer",

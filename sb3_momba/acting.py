@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
+from sb3_momba.checkpoints.training_state import set_states_of_callbacks
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
 from sb3_momba.policies import MombaPolicy
@@ -25,6 +27,8 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     policy: MombaPolicy
     preference_sampler: PreferenceSampler | SamplerSpec | None
     deterministic_exploration: bool
+    _root_callback: BaseCallback | None = None
+    _states_of_callbacks: dict[str, Any] | None = None  # from a checkpoint, for the callbacks of the next `learn`
 
     @staticmethod
     def _wrap_env(env: GymEnv | str | Callable[[], gym.Env], verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -133,4 +137,14 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             self.policy.return_scale.end_episodes()
             self.replay_buffer.end_episodes()
         self.replay_buffer.check_memory()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        total_timesteps, root = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._root_callback = root
+        if self._states_of_callbacks is not None:
+            set_states_of_callbacks(root, self._states_of_callbacks)
+            self._states_of_callbacks = None
+        return total_timesteps, root
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """What the last `learn` had before it: after `resume`, `learn(remaining_timesteps, reset_num_timesteps=False)`."""
+        return max(int(self._total_timesteps) - self.num_timesteps, 0)

@@ -1,5 +1,6 @@
 """A replay buffer of vector rewards and the preferences under which they were earned."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,6 +78,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         raw_dim = observation_space.shape[0] - self.preference_dim
         raw_space = spaces.Box(observation_space.low[:raw_dim], observation_space.high[:raw_dim], dtype=np.float32)
         super().__init__(buffer_size, raw_space, action_space, device, n_envs)
+        self.n_added = 0  # rows since the training began, those overwritten among them
         self.rewards = np.zeros((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.preferences = np.ones((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.gamma = gamma
@@ -135,6 +137,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         if self.preference_dim > 0:
             self.preferences[self.pos] = obs[:, raw:]
         super().add(obs[:, :raw], next_obs[:, :raw], action, vector_rewards, done, infos)
+        self.n_added += 1
 
     def _check_wrapper_order(
         self, appended: np.ndarray, reward: np.ndarray, vector_rewards: np.ndarray, infos: list[dict[str, Any]]
@@ -160,10 +163,15 @@ class PreferenceReplayBuffer(ReplayBuffer):
         """Of the step stored last, (n_envs, n_objectives)."""
         return self.rewards[self.pos - 1]
 
-    def end_episodes(self) -> None:
-        """Truncate the trajectories that are not finished, as when the environments are reset from outside."""
+    def end_episodes(self, indices: Sequence[int] | None = None) -> None:
+        """Truncate the trajectories that are not finished, as when the environments are reset from outside.
+
+        :param indices: of these environments; by default all
+        """
         if self.size() > 0:
             unfinished = self.dones[self.pos - 1] == 0
+            if indices is not None:
+                unfinished &= np.isin(np.arange(self.n_envs), indices)
             self.dones[self.pos - 1][unfinished] = 1
             self.timeouts[self.pos - 1][unfinished] = 1
 

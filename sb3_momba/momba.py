@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import os
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,6 +15,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_momba.acting import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
+from sb3_momba.checkpoints.checkpoint import resume
+from sb3_momba.checkpoints.folders import Checkpoint
+from sb3_momba.checkpoints.training_state import callbacks_below
 from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
@@ -76,6 +80,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     actor: Actor  # type: ignore[assignment]
     critic: Critic
     critic_target: Critic
+    _resumed_from: Checkpoint | None = None
 
     def __init__(
         self,
@@ -397,13 +402,33 @@ class MOMBA(PreferenceConditionedAlgorithm):
         progress_bar: bool = False,
     ) -> Self:
         """Train for `total_timesteps` environment steps; SB3's signature."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        try:
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        finally:
+            for _, one in callbacks_below(self._root_callback):
+                getattr(one, "after_learn", lambda: None)()
 
     # ---------------------------------------------------------------------------------------------------- saving
 
+    @classmethod
+    def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Self:
+        """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)`
+        goes on exactly as if nothing had happened, callbacks of the same kinds in the same places included.
+
+        The same holds for the bits of every number on the same machine with the same versions and number of threads, for
+        environments whose only randomness is Gymnasium's `np_random`. For others it is said what was lost.
+
+        :param path: folder of a MombaCheckpointCallback, or one of the checkpoints in it; damaged ones are passed over
+        :param env: an environment of the same kind, and as many
+        :param kwargs: of `load`
+        :raises FileFormatError: if no checkpoint is whole, naming what is damaged
+        """
+        return resume(cls, path, env, **kwargs)
+
     def _excluded_save_params(self) -> list[str]:
         derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor", "_metrics", "_negative_returns"]
-        return [*super()._excluded_save_params(), *derived]
+        of_the_process = ["_root_callback", "_states_of_callbacks", "_resumed_from"]
+        return [*super()._excluded_save_params(), *derived, *of_the_process]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         if self.ent_coef_optimizer is None:

@@ -8,6 +8,8 @@ A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has a
 - `floor`, one for each policy that learned nothing: `policy`, `values` (n, n_objectives) and the metrics.
 - `evaluation`, one for each point of the curve: `steps`, which rise, `seconds` (of training, without evaluations),
   `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives).
+- `resumed`, where the run went on from a checkpoint: its `steps` (evaluations after them were made again, and the later ones
+  count), `versions`, `machine`, `git_revision` and `started`.
 - `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `returns` and `discounted_returns`
   (n, episodes, n_objectives), `episode_lengths` (n, episodes), the `preferences` that they answer and its `settings`; one that
   "failed" has its `error`.
@@ -59,9 +61,7 @@ class RecordWriter:
 
     def start(self, **content: Any) -> "RecordWriter":
         """:param content: of the first line, beside versions, machine, revision and time"""
-        provenance = {"versions": library_versions(), "machine": machine(), "git_revision": git_revision()}
-        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        line = _line("start", format=FORMAT, version=VERSION, **content, **provenance, started=now)
+        line = _line("start", format=FORMAT, version=VERSION, **content, **_provenance())
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # Held until the end: whoever deletes the record does not find lines of this run in the next one.
         self.file = open(self.path, "ab", buffering=0, opener=_only_new)  # noqa: SIM115
@@ -70,6 +70,18 @@ class RecordWriter:
         except BaseException:
             self.file.close()
             self.path.unlink()
+            raise
+        return self
+
+    def resume(self, steps: int) -> "RecordWriter":
+        """Go on with the record of a run that was cut off, from a checkpoint at `steps`."""
+        self.file = open(self.path, "r+b", buffering=0)  # noqa: SIM115
+        self.file.truncate(self.path.read_bytes().rfind(b"\n") + 1)  # A line that was cut off is none.
+        self.file.seek(0, os.SEEK_END)
+        try:
+            self._write(_line("resumed", steps=steps, **_provenance()))
+        except BaseException:
+            self.file.close()
             raise
         return self
 
@@ -101,6 +113,11 @@ class RecordWriter:
             if isinstance(error, Exception) and not self.is_ended:
                 self.is_ended = True
                 self.append("end", status="failed", error=f"{type(error).__name__}: {error}".removesuffix(": "))
+
+
+def _provenance() -> dict[str, Any]:
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return {"versions": library_versions(), "machine": machine(), "git_revision": git_revision(), "started": now}
 
 
 def _only_new(path: str, flags: int) -> int:
@@ -250,9 +267,13 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
     final_values: Array | None = None
     error: str | None = UNENDED
     for event in events[1:]:
-        if error != UNENDED or final_values is not None:
+        if event["event"] == "resumed" and final_values is None:
+            resumed_at = _whole(event["steps"], "steps")
+            evaluations = [evaluation for evaluation in evaluations if evaluation.steps <= resumed_at]
+            error = UNENDED
+        elif error != UNENDED or final_values is not None:
             raise FileFormatError("it goes on after its end.")
-        if event["event"] == "floor":
+        elif event["event"] == "floor":
             floors.append(Floor(str(event["policy"]), _numbers(event["values"], "a floor's values", shape)))
         elif event["event"] == "evaluation":
             values = _numbers(event["values"], "an evaluation's values", shape)

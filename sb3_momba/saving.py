@@ -52,10 +52,14 @@ class PickleFreeSaving(OffPolicyAlgorithm):
 
         :raises TypeError: names an attribute that cannot be stored without pickle
         """
+        write_tree(with_suffix(path, ".zip"), self.tree(exclude, include))
+
+    def tree(self, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> dict[str, Any]:
+        """What `save` writes."""
         module_names, tensor_names = self._get_torch_save_params()
         excluded = set(exclude or ()) | (set(self._excluded_save_params()) - set(include or ()))
         excluded |= {name.split(".")[0] for name in [*module_names, *tensor_names]}
-        tree = {
+        return {
             "format": MODEL_FORMAT,
             "version": FORMAT_VERSION,
             "versions": library_versions(),
@@ -63,7 +67,6 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             "params": self.get_parameters(),
             "tensors": {name: recursive_getattr(self, name) for name in tensor_names},
         }
-        write_tree(with_suffix(path, ".zip"), tree)
 
     @classmethod
     def load(  # type: ignore[override]
@@ -178,6 +181,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             array = tree["arrays"][name]
             getattr(buffer, name)[: len(array)] = array
         buffer.pos, buffer.full = tree["pos"], tree["full"]
+        buffer.n_added = buffer.pos + (buffer.buffer_size if buffer.full else 0)
         buffer.rng.bit_generator.state = tree["rng"]
         if truncate_last_traj:
             buffer.end_episodes()

@@ -18,9 +18,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import yaml
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
 from sb3_momba.momba import MOMBA
@@ -28,8 +30,9 @@ from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
 from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.floors import evaluate_floors
+from sb3_momba.pareto.metrics import summarise
 from sb3_momba.records import FILE_NAME as RECORD_NAME
-from sb3_momba.records import RecordWriter, plain
+from sb3_momba.records import RecordWriter, plain, read_record
 from sb3_momba.settings import check_whole
 from sb3_momba.zoo.configuration import (
     Configuration,
@@ -41,7 +44,9 @@ from sb3_momba.zoo.configuration import (
 )
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
-NOT_RECORDED = ("output", "progress_bar", "eval_workers")  # No result depends on them.
+CHECKPOINTS = "checkpoints"
+# No result depends on them.
+NOT_RECORDED = ("output", "progress_bar", "eval_workers", "checkpoint_freq", "keep_checkpoints")
 
 
 @dataclass
@@ -54,6 +59,8 @@ class RunSettings:
     :param output: the run's folder; must not hold a run already
     :param eval_freq: environment steps between evaluations
     :param eval_workers: processes that share an evaluation
+    :param checkpoint_freq: environment steps between checkpoints
+    :param keep_checkpoints: how many of them stay
     :param reference_point: of the hypervolume; None: the task's in `pareto/protocol.py`
     """
 
@@ -73,6 +80,8 @@ class RunSettings:
     reference_point: list[float] | None = None
     objectives: list[str] | None = None
     eval_workers: int = 1
+    checkpoint_freq: int = 10_000
+    keep_checkpoints: int = 2
     device: str = "auto"
     progress_bar: bool = True
 
@@ -100,9 +109,10 @@ class Prepared:
 
 
 @contextlib.contextmanager
-def prepared(settings: RunSettings) -> Iterator[Prepared]:
+def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]:
     """The model, with its environments open, and its evaluation. Nothing is written.
 
+    :param resumed: the model of the newest checkpoint instead of a new one
     :raises ValueError: for settings that cannot be
     """
     check_hyperparameters(settings.policy, settings.hyperparameters)
@@ -125,7 +135,10 @@ def prepared(settings: RunSettings) -> Iterator[Prepared]:
             best_model_save_path=folder,
             callback_after_eval=RecordCallback(record),
         )
-        model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
+        if resumed:
+            model = MOMBA.resume(folder / CHECKPOINTS, env, device=settings.device)
+        else:
+            model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
         evaluation.check(model)
         preferences = preference_grid(model.n_objectives, settings.n_preferences)
         yield Prepared(model, evaluation, record, preferences, reference_point)
@@ -146,17 +159,45 @@ def run(settings: RunSettings) -> RunResult:
         }
         start = description(settings, ready.preferences, ready.reference_point, sizes)
         with ready.record.start(**start) as record:
-            floors = {}
             for name, front in evaluate_floors(evaluation.eval_env, ready.preferences, settings.n_episodes).items():
-                floors[name] = front.metrics(ready.reference_point)
-                record.append("floor", policy=name, **floors[name], values=front.values)
+                record.append("floor", policy=name, **front.metrics(ready.reference_point), values=front.values)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-            try:
-                model.learn(settings.steps, callback=evaluation, progress_bar=settings.progress_bar)
-            finally:
-                model.save(folder / "model.zip")
-            assert evaluation.front is not None
-            record.finish(model.num_timesteps, vars(evaluation.front))
+            return _train(settings, ready, record, settings.steps)
+
+
+def resume(folder: Path, **running: Any) -> RunResult:
+    """Go on with a run that was cut off, from its newest checkpoint.
+
+    :param running: settings that no result depends on, such as eval_workers
+    :raises ValueError: if there is nothing to go on with
+    """
+    path = folder / RECORD_NAME
+    if not path.is_file():
+        raise ValueError(f"{folder} holds no run: give the folder that a run was started with as its --output.")
+    found = read_record(path)
+    if found.error is None:
+        raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
+    settings = RunSettings(**{**found.config, **running, "output": str(folder)})
+    with prepared(settings, resumed=True) as ready, ready.record.resume(ready.model.num_timesteps) as record:
+        name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
+        ready.model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]))
+        return _train(settings, ready, record, ready.model.remaining_timesteps)
+
+
+def _train(settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int) -> RunResult:
+    folder, model, evaluation = Path(settings.output), ready.model, ready.evaluation
+    checkpoints = MombaCheckpointCallback(settings.checkpoint_freq, folder / CHECKPOINTS, settings.keep_checkpoints)
+    try:
+        callbacks = CallbackList([evaluation, checkpoints])
+        model.learn(steps, callbacks, reset_num_timesteps=model.num_timesteps == 0, progress_bar=settings.progress_bar)
+    finally:
+        model.save(folder / "model.zip")
+    assert evaluation.front is not None
+    record.finish(model.num_timesteps, vars(evaluation.front))
+    floors = {
+        floor.policy: summarise(floor.values, ready.preferences, ready.reference_point)
+        for floor in read_record(record.path).floors
+    }
     return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, floors, folder)
 
 
@@ -213,6 +254,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         prog="python -m sb3_momba.train", description="Train MOMBA and evaluate its Pareto front.", allow_abbrev=False
     )
     parser.add_argument("--env", required=True, help="environment id")
+    parser.add_argument("--resume", metavar="RUN", help="go on with a run that was cut off")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=whole_number, help="environment steps; by default the configuration's, or 1e6")
     parser.add_argument(
@@ -243,7 +285,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     machine.add_argument("--n-envs", type=int, help="environments side by side")
     machine.add_argument("--subprocesses", action="store_true", help="each in a process of its own")
     machine.add_argument("--device", default="auto")
-    machine.add_argument("--no-progress-bar", action="store_true")
+    add_running_arguments(machine)
 
     evaluation = parser.add_argument_group("evaluation")
     evaluation.add_argument("--eval-freq", type=whole_number, default=50_000, help="environment steps")
@@ -252,7 +294,6 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     evaluation.add_argument(
         "--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0"
     )
-    evaluation.add_argument("--eval-workers", type=int, default=1, help="processes that share an evaluation")
     evaluation.add_argument("--objectives", nargs="+", help="names for the picture's axes")
 
     given = parser.parse_args(arguments)
@@ -292,8 +333,10 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         reference_point=given.reference_point,
         objectives=given.objectives,
         eval_workers=given.eval_workers,
+        checkpoint_freq=given.checkpoint_freq,
+        keep_checkpoints=given.keep_checkpoints,
         device=given.device,
-        progress_bar=not given.no_progress_bar,
+        progress_bar=given.progress_bar,
     )
 
 
@@ -326,13 +369,35 @@ def assign(values: dict[str, Any], assignment: str, option: str = "--set") -> No
         raise ValueError(f"{option} {assignment}: {text!r} is no yaml literal.") from error
 
 
+def parse_resume(arguments: Sequence[str]) -> argparse.Namespace | None:
+    """What `--resume` goes with; None where it is not given."""
+    parser = argparse.ArgumentParser(prog="python -m sb3_momba.train", allow_abbrev=False, add_help=False)
+    parser.add_argument("--resume", type=Path, metavar="RUN")
+    add_running_arguments(parser)
+    given, others = parser.parse_known_args(arguments)
+    if given.resume is not None and others:
+        raise ValueError(f"--resume goes on with a run's own settings: leave {others[0]} out.")
+    return None if given.resume is None else given
+
+
+def add_running_arguments(parser: argparse._ActionsContainer) -> None:
+    """Those that no result depends on."""
+    parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")
+    parser.add_argument("--eval-workers", type=int, default=1, help="processes that share an evaluation")
+    parser.add_argument("--checkpoint-freq", type=whole_number, default=10_000, help="environment steps between checkpoints")
+    parser.add_argument("--keep-checkpoints", type=int, default=2, help="how many stay")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        result = run(parse(arguments))
+        given = parse_resume(arguments)
+        running = {} if given is None else vars(given)
+        result = run(parse(arguments)) if given is None else resume(running.pop("resume"), **running)
     except (ValueError, MemoryError, ImportError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        print("\nInterrupted: the run's folder holds the model as it was.", file=sys.stderr)
+        print("\nInterrupted. The run's folder holds the model and a checkpoint: go on with --resume FOLDER.", file=sys.stderr)
         sys.exit(130)
     print(report(result))
 

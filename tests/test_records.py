@@ -35,7 +35,7 @@ from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy, evaluate_flo
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
 from sb3_momba.records import UNENDED, Record, RecordWriter, find_records, is_cut_off_at_its_start, read_record
-from sb3_momba.train import RunSettings, main, plain, run
+from sb3_momba.train import NOT_RECORDED, RunSettings, main, plain, run
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
 from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
 
@@ -205,7 +205,7 @@ def test_seconds_are_of_training_and_evaluations_apart(tmp_path, monkeypatch) ->
 
 def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:
     config = tiny_run.lines[0]["config"]
-    assert set(config) == {field.name for field in fields(RunSettings)} - {"output", "progress_bar", "eval_workers"}
+    assert set(config) == {field.name for field in fields(RunSettings)} - set(NOT_RECORDED)
     assert (config["steps"], config["eval_freq"], config["n_episodes"], config["policy"]) == (120, 60, 2, "SimbaPolicy")
     written = config["hyperparameters"]
     arguments = inspect.signature(MOMBA.__init__).parameters

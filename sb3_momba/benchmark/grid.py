@@ -17,9 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_momba.benchmark.results import flat
+from sb3_momba.checkpoints.folders import newest
+from sb3_momba.files import FileFormatError
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
 from sb3_momba.settings import parse_ent_coef
-from sb3_momba.train import RunSettings, parse, prepared, record_failure, recorded_settings
+from sb3_momba.train import CHECKPOINTS, RunSettings, parse, prepared, record_failure, recorded_settings
 from sb3_momba.zoo.configuration import read_configuration
 
 logger = logging.getLogger(__name__)
@@ -129,11 +131,13 @@ def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) 
 def _run_cell(cell: Cell, settings: RunSettings) -> None:
     logger.info("%s starts", cell.name)
     folder = Path(settings.output)
-    if folder.exists():
+    goes_on = can_go_on(folder)
+    if folder.exists() and not goes_on:
         shutil.rmtree(folder)  # What was cut off or failed; see `has_to_run`.
     folder.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "sb3_momba.train", *cell.arguments(folder)]
-    with open(log_of(folder), "wb") as log:
+    arguments = ["--resume", str(folder), "--no-progress-bar"] if goes_on else cell.arguments(folder)
+    command = [sys.executable, "-m", "sb3_momba.train", *arguments]
+    with open(log_of(folder), "ab" if goes_on else "wb") as log:
         # Runs side by side share the cores: one thread each.
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
@@ -144,6 +148,18 @@ def _run_cell(cell: Cell, settings: RunSettings) -> None:
         record_failure(settings, f"it did not start: {next((line for line in reversed(said) if line.strip()), 'no output')}")
     error = read_record(record).error
     logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
+
+
+def can_go_on(folder: Path) -> bool:
+    """Whether a run was cut off, and left a checkpoint that is whole."""
+    record = folder / FILE_NAME
+    if not record.exists() or is_cut_off_at_its_start(record) or read_record(record).error != UNENDED:
+        return False
+    try:
+        newest(folder / CHECKPOINTS)
+    except (FileNotFoundError, FileFormatError):
+        return False
+    return True
 
 
 def log_of(folder: Path) -> Path:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, Su
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 
 LARGEST_REWARD = 1e10
+LONGEST_REPLAY = 20_000  # actions of an episode that are noted
 
 EnvLike = str | gym.Env | Callable[[], gym.Env]
 
@@ -64,6 +65,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._holds_for_episode = False
         self._rng = np.random.default_rng()
         self._episode_step = 0
+        self._episode: dict[str, Any] = {"actions": None}
 
         box = env.observation_space
         assert isinstance(box, spaces.Box)
@@ -105,6 +107,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         if seed is not None:
             # A stream of its own: the environment draws from default_rng(seed) itself.
             self._rng = np.random.default_rng([seed, 1])
+        self._episode = {
+            "seed": seed,
+            "options": options or None,
+            "env_rng": None if seed is not None else self.np_random.bit_generator.state,
+            "rng": self._rng.bit_generator.state,
+            "actions": [],
+        }
         observation, info = self.env.reset(seed=seed, options=options or None)
         self._episode_step = 0
         self._holds_for_episode = given is not None
@@ -112,6 +121,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         return self._observe(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
+        self._note_action(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         assert self._preference is not None, "call reset() before step()"
         self._episode_step += 1
@@ -123,6 +133,40 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             if not self._holds_for_episode:
                 self._preference = self._next_preference()
         return self._observe(observation), float(np.dot(w, vector_reward)), terminated, truncated, info
+
+    def _note_action(self, action: np.ndarray) -> None:
+        """For a checkpoint in mid-episode, up to LONGEST_REPLAY of them."""
+        actions = self._episode["actions"]
+        if actions is not None:
+            actions.append(np.array(action))
+            if len(actions) > LONGEST_REPLAY:
+                self._episode["actions"] = None
+
+    def episode_so_far(self) -> dict[str, Any]:
+        """What is needed to play the running episode again: the random numbers at its reset, the actions since, and the
+        preferences of this moment. `actions` is None where there is no episode, or too long a one."""
+        return {
+            **self._episode,
+            "episode_step": self._episode_step,
+            "preference": self._preference,
+            "fixed_preference": self._fixed_preference,
+            "holds_for_episode": self._holds_for_episode,
+            "rng_now": self._rng.bit_generator.state,
+        }
+
+    def begin_replay(self, state: dict[str, Any]) -> dict[str, Any]:
+        """Set the random numbers to those before an episode's reset; the arguments of that reset."""
+        if state["env_rng"] is not None:
+            self.np_random.bit_generator.state = state["env_rng"]
+        self._rng.bit_generator.state = state["rng"]
+        return {"seed": state["seed"], "options": state["options"]}
+
+    def end_replay(self, state: dict[str, Any]) -> np.ndarray:
+        """Set the preferences to those of the moment when `state` was noted; [observation, w] of that moment."""
+        self._fixed_preference, self._preference = state["fixed_preference"], state["preference"]
+        self._holds_for_episode = state["holds_for_episode"]
+        self._rng.bit_generator.state = state["rng_now"]
+        return self._observe(self._observation)
 
     def _next_preference(self) -> np.ndarray:
         if self._fixed_preference is not None:
@@ -144,6 +188,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def _observe(self, observation: np.ndarray) -> np.ndarray:
         """[observation, w], always a fresh array: the environment may use its own again."""
         assert self._preference is not None
+        self._observation = observation
         if np.shape(observation) != self.raw_shape:
             raise ValueError(
                 f"{self._where()}: the observation has shape {np.shape(observation)} where {self.raw_shape} is declared: "

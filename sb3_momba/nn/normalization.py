@@ -1,5 +1,7 @@
 """Running statistics that put observations and rewards on the networks' scale (sections 3.3 and 3.4.1)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch as th
 from torch import nn
@@ -77,9 +79,15 @@ class ReturnScale(nn.Module):
         self.max_return.fill_(max(float(self.max_return), float(np.abs(self.running_returns).max())))
         self.running_returns[dones.astype(bool)] = 0.0
 
-    def end_episodes(self) -> None:
-        """The next rewards begin new returns, in any number of environments."""
-        self.running_returns = None
+    def end_episodes(self, indices: Sequence[int] | None = None) -> None:
+        """The next rewards begin new returns, in any number of environments.
+
+        :param indices: in these environments only
+        """
+        if indices is None:
+            self.running_returns = None
+        elif self.running_returns is not None:
+            self.running_returns[list(indices)] = 0.0
 
     @property
     def factor(self) -> float:

@@ -22,6 +22,11 @@ from sb3_momba.pareto.plotting import plot_front
 from sb3_momba.pareto.protocol import N_EPISODES, N_PREFERENCES
 from sb3_momba.records import RecordWriter
 
+STATE = (
+    *("next_evaluation", "go_on", "is_evaluated", "timesteps", "metrics", "values", "evaluation_seconds"),
+    *("last_mean_reward", "best_mean_reward", "best_score", "warned_of_reference_point"),
+)
+
 logger = logging.getLogger(__name__)
 
 
@@ -112,6 +117,16 @@ class ParetoEvalCallback(EventCallback):
         if self.objectives is not None and len(self.objectives) != n_objectives:
             raise ValueError(f"objectives={self.objectives}: {n_objectives} names are needed, one per objective.")
 
+    def state_dict(self) -> dict[str, Any]:
+        """For a checkpoint: what has been measured, and when to measure next."""
+        front = None if self.front is None else vars(self.front)
+        return {"front": front, **{name: getattr(self, name) for name in STATE}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.front = None if state["front"] is None else ParetoFront(**state["front"])
+        for name in STATE:
+            setattr(self, name, state[name])
+
     def _on_rollout_start(self) -> None:
         # Only here have the last transition and the updates that follow it been made.
         if self.model.num_timesteps >= self.next_evaluation:
@@ -194,16 +209,28 @@ class RecordCallback(BaseCallback):
     def __init__(self, record: RecordWriter):
         super().__init__()
         self.record = record
+        self.seconds_before = 0.0
 
     def _on_training_start(self) -> None:
-        self.started = time.perf_counter() - self.parent.evaluation_seconds
+        self.started = time.perf_counter() - self.parent.evaluation_seconds - self.seconds_before
+
+    @property
+    def seconds(self) -> float:
+        """Of training so far, without evaluations."""
+        return time.perf_counter() - self.started - self.parent.evaluation_seconds
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.seconds_before = state["seconds"]
 
     def _on_step(self) -> bool:
         evaluating = self.parent.evaluation_seconds
         self.record.append(
             "evaluation",
             steps=self.parent.num_timesteps,
-            seconds=round(time.perf_counter() - self.started - evaluating, 3),
+            seconds=round(self.seconds, 3),
             evaluation_seconds=round(evaluating, 3),
             **self.parent.metrics[-1],
             values=self.parent.values[-1],

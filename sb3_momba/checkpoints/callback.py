@@ -1,0 +1,95 @@
+"""Checkpoints while training."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_momba.checkpoints.checkpoint import write_checkpoint
+from sb3_momba.checkpoints.folders import CheckpointWriter
+
+if TYPE_CHECKING:
+    from sb3_momba.momba import MOMBA
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class MombaCheckpointCallback(BaseCallback):
+    """Write everything that the training is into `path`, every `save_freq` environment steps and at its end.
+
+    `MOMBA.resume(path, env)` goes on from the newest checkpoint that is whole. SIGINT (Ctrl-C) and SIGTERM write one too, and
+    then end the training by KeyboardInterrupt and SystemExit; a second signal does not wait for it.
+
+    :param save_freq: environment steps, over all training environments
+    :param path: folder of the checkpoints
+    :param keep: how many of them stay
+    """
+
+    model: "MOMBA"
+
+    def __init__(self, save_freq: int, path: str | os.PathLike[str], keep: int = 3, verbose: int = 0):
+        super().__init__(verbose)
+        if save_freq < 1:
+            raise ValueError(f"save_freq={save_freq}: give the number of environment steps between checkpoints.")
+        if keep < 1:
+            raise ValueError(f"keep={keep}: at least one checkpoint must stay.")
+        self.save_freq = int(save_freq)
+        self.path = Path(path)
+        self.writer = CheckpointWriter(path, keep)
+        self.segments: list[str] = []
+        self.received: int | None = None
+        self.handlers: dict[int, Any] = {}
+
+    def _init_callback(self) -> None:
+        resumed_from = self.model._resumed_from
+        if resumed_from is not None and resumed_from.folder.parent.resolve() == self.path.resolve():
+            self.writer.go_on_from(resumed_from)
+            self.segments = list(resumed_from.shared)
+        self.saved_at = self.model.num_timesteps
+        self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
+
+    def _on_training_start(self) -> None:
+        self.root: BaseCallback = self.locals["callback"]
+        if threading.current_thread() is threading.main_thread():
+            self.handlers = {number: signal.signal(number, self._note) for number in SIGNALS}
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.received = number
+        self._restore_handlers()
+
+    def _restore_handlers(self) -> None:
+        while self.handlers:
+            signal.signal(*self.handlers.popitem())
+
+    def _on_rollout_start(self) -> None:
+        # Only here have the last transition and the updates that follow it been made.
+        if self.model.num_timesteps >= self.next_save or self.received is not None:
+            self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
+            self.save()
+        if self.received is not None:
+            number, self.received = self.received, None
+            if number == signal.SIGINT:
+                raise KeyboardInterrupt
+            raise SystemExit(128 + number)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def after_learn(self) -> None:
+        """However `learn` has ended."""
+        self._restore_handlers()
+
+    def _on_training_end(self) -> None:
+        if self.saved_at < self.model.num_timesteps:
+            self.save()
+
+    def save(self) -> None:
+        """Write a checkpoint now."""
+        self.segments = write_checkpoint(self.model, self.writer, self.segments, self.root)
+        self.saved_at = self.model.num_timesteps
+        if self.verbose >= 1:
+            print(f"Checkpoint at {self.saved_at:,} steps in {self.path}")

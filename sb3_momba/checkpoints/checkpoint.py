@@ -1,0 +1,75 @@
+"""Writing a training into a checkpoint, and going on from one."""
+
+import os
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_momba.checkpoints import environments
+from sb3_momba.checkpoints.folders import CheckpointWriter, newest
+from sb3_momba.checkpoints.replay_segments import read_segments, write_segments
+from sb3_momba.checkpoints.training_state import (
+    random_states,
+    set_random_states,
+    set_statistics,
+    states_of_callbacks,
+    statistics_of,
+)
+from sb3_momba.files import FileFormatError, read_tree
+
+if TYPE_CHECKING:
+    from sb3_momba.momba import MOMBA
+
+MODEL, STATE = "model.zip", "state.zip"
+
+Model = TypeVar("Model", bound="MOMBA")
+
+
+def write_checkpoint(model: "MOMBA", writer: CheckpointWriter, segments: list[str], callback: BaseCallback | None) -> list[str]:
+    """Between two rollouts, when the last transition is stored and its updates are made.
+
+    :param segments: those of the checkpoint before
+    :param callback: the root of the training's callbacks
+    :return: the segments that belong to this checkpoint
+    """
+    assert model.env is not None
+    segments, buffer = write_segments(model.replay_buffer, writer, segments)
+    state = {
+        "random": random_states(model),
+        "buffer": buffer,
+        "environments": environments.states_of(model.env),
+        "statistics": statistics_of(model),
+        "callbacks": states_of_callbacks(callback),
+    }
+    writer.write(model.num_timesteps, {MODEL: model.tree(), STATE: state}, segments)
+    return segments
+
+
+def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Model:
+    """See `MOMBA.resume`."""
+    checkpoint = newest(path)
+    missing = [file for file in (MODEL, STATE) if file not in checkpoint.files]
+    if missing:
+        raise FileFormatError(f"{checkpoint.folder} is not a whole checkpoint: it has no {missing[0]}.")
+    model = cls.load(checkpoint.folder / MODEL, env, force_reset=False, **kwargs)
+    try:
+        state, _ = read_tree(checkpoint.folder / STATE)
+        read_segments(model.replay_buffer, checkpoint, state["buffer"])
+        set_statistics(model, state["statistics"])
+        _bring_back_environments(model, state["environments"])
+        set_random_states(model, state["random"])
+    except (KeyError, TypeError, IndexError, AttributeError) as error:
+        raise FileFormatError(f"{checkpoint.folder} is not a whole checkpoint: {type(error).__name__}: {error}") from error
+    model._resumed_from = checkpoint
+    model._states_of_callbacks = state["callbacks"]
+    return model
+
+
+def _bring_back_environments(model: "MOMBA", states: list[dict[str, Any]] | None) -> None:
+    assert model.env is not None
+    assert model._last_obs is not None
+    model._last_obs, lost = environments.bring_back(model.env, states, model._last_obs)  # type: ignore[arg-type]
+    if lost:
+        model.replay_buffer.end_episodes(lost)
+        model.policy.return_scale.end_episodes(lost)

@@ -1,0 +1,306 @@
+"""Checkpoints: whole or not there, and a training that goes on from one as if nothing had happened."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, make_mo_vec_env
+from sb3_momba.buffers import STORED_ARRAYS
+from sb3_momba.checkpoints.folders import CheckpointWriter, checkpoints_in, newest, number_of
+from sb3_momba.checkpoints.replay_segments import rows_of
+from sb3_momba.envs.preferences import PerStepSampler, UniformSampler
+from sb3_momba.files import FileFormatError, read_tree
+from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv, assert_same_tree
+
+SETTINGS = {"seed": 0, "learning_starts": 30, "batch_size": 16, "buffer_size": 150, "device": "cpu"}
+
+
+def new_model(env, policy: str = "SimbaPolicy", **kwargs) -> MOMBA:
+    sizes = TINY_MLP if policy == "MlpPolicy" else TINY_SIMBA
+    return MOMBA(policy, env, **{**SETTINGS, "policy_kwargs": sizes, **kwargs})
+
+
+def everything(model: MOMBA) -> dict:
+    """What makes two trainings the same."""
+    size = model.replay_buffer.size()
+    return {
+        "parameters": model.get_parameters(),
+        "alpha": model.alpha,
+        "buffer": {name: getattr(model.replay_buffer, name)[:size] for name in STORED_ARRAYS},
+        "place": [model.replay_buffer.pos, model.replay_buffer.full, model.replay_buffer.n_added],
+        "observations": model._last_obs,
+        "steps": [model.num_timesteps, model._n_updates, model._episode_num],
+        "running_returns": model.policy.return_scale.running_returns,
+        "random": [th.get_rng_state(), model.replay_buffer.rng.bit_generator.state],
+    }
+
+
+def checkpointed(env, path, steps: int, save_freq: int, **kwargs) -> MOMBA:
+    return new_model(env, **kwargs).learn(steps, MombaCheckpointCallback(save_freq, path, keep=20))
+
+
+def gone_on(path, env, callback=None) -> MOMBA:
+    model = MOMBA.resume(path, env, device="cpu")
+    return model.learn(model.remaining_timesteps, callback, reset_num_timesteps=False)
+
+
+VARIANTS = {
+    "Momba": {},
+    "one objective": {"env": "Pendulum-v1"},
+    "MlpPolicy, vector, mse, HER, PAR": {
+        **{"policy": "MlpPolicy", "vector_values": True, "critic_loss": "mse", "her": True},
+        "preference_alignment": True,
+    },
+    "CAPQL's exploration, a preference per step": {"deterministic_exploration": True, "preference_sampler": PerStepSampler(UniformSampler())},
+    "3-step returns, four environments": {"n_steps": 3, "n_envs": 4, "gradient_steps": -1},
+    "episodes": {"train_freq": (1, "episode"), "gradient_steps": 2},
+    "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": "linear"},
+}
+
+
+@pytest.mark.filterwarnings("ignore:preference_alignment assumes", "ignore:.*was not stored")
+@pytest.mark.parametrize("kwargs", VARIANTS.values(), ids=VARIANTS)
+def test_going_on_from_any_checkpoint_is_never_having_stopped(kwargs, tmp_path):
+    kwargs = dict(kwargs)
+    env, n_envs = kwargs.pop("env", "MO-Hopper-v4"), kwargs.pop("n_envs", 1)
+    if kwargs.get("learning_rate") == "linear":
+        from stable_baselines3.common.utils import LinearSchedule
+
+        kwargs["learning_rate"] = LinearSchedule(1e-3, 1e-5, 1.0)
+    undisturbed = everything(new_model(make_mo_vec_env(env, n_envs), **kwargs).learn(240 * n_envs))
+    observed = checkpointed(make_mo_vec_env(env, n_envs), tmp_path, 240 * n_envs, 53 * n_envs, **kwargs)
+    assert_same_tree(everything(observed), undisturbed)
+    folders = checkpoints_in(tmp_path)
+    assert len(folders) >= 2
+    for folder in folders:
+        resumed = gone_on(folder, make_mo_vec_env(env, n_envs))
+        assert_same_tree(everything(resumed), undisturbed)
+
+
+def test_going_on_in_processes_of_their_own(tmp_path):
+    def make():
+        return make_mo_vec_env("MO-Hopper-v4", 2, vec_env_cls=SubprocVecEnv)
+
+    env = make()
+    undisturbed = everything(checkpointed(env, tmp_path, 200, 70))
+    env.close()
+    env = make()
+    resumed = everything(gone_on(checkpoints_in(tmp_path)[-1], env))
+    env.close()
+    assert_same_tree(resumed, undisturbed)
+
+
+def test_a_buffer_that_has_gone_round_many_times(tmp_path):
+    undisturbed = everything(checkpointed(StubEnv(), tmp_path, 500, 40, buffer_size=64))
+    for folder in checkpoints_in(tmp_path):
+        assert_same_tree(everything(gone_on(folder, stub_at(folder))), undisturbed)
+
+
+def stub_at(folder: Path) -> StubEnv:
+    """StubEnv counts its steps over all episodes: one that begins where the running episode began."""
+    env = StubEnv()
+    (state,), steps = read_tree(folder / "state.zip")[0]["environments"], int(folder.name[5:])
+    env.n_steps = steps - len(state["actions"])
+    return env
+
+
+# ------------------------------------------------------------------------------------------------- the weaker promise
+
+
+class OwnRandomness(StubEnv):
+    """Draws its observations from a stream that Gymnasium does not know."""
+
+    def step(self, action):
+        observation, *others = super().step(action)
+        return observation + np.random.default_rng().random(3), *others
+
+
+def test_an_environment_that_cannot_be_brought_back_is_named(tmp_path):
+    checkpointed(OwnRandomness(), tmp_path, 65, 100)
+    with pytest.warns(UserWarning, match=r"Environments \[0\] could not be brought back.*as truncated"):
+        model = MOMBA.resume(tmp_path, OwnRandomness())
+    last = model.replay_buffer.pos - 1
+    assert model.replay_buffer.dones[last] == 1
+    assert model.replay_buffer.timeouts[last] == 1
+    assert (model.policy.return_scale.running_returns == 0).all()
+    assert model._last_obs[0, 0] % 1 == 0.5  # a new episode
+    model.learn(20, reset_num_timesteps=False)
+
+
+# ----------------------------------------------------------------------------------------------------------- callbacks
+
+
+def test_callbacks_go_on_where_they_were(tmp_path):
+    def callbacks(path, folder):
+        evaluation = ParetoEvalCallback("MO-Hopper-v4", eval_freq=60, n_preferences=3, n_episodes=1, log_path=folder)
+        every = EveryNTimesteps(45, Counter())
+        return CallbackList([evaluation, every, MombaCheckpointCallback(50, path, keep=9)])
+
+    undisturbed = callbacks(tmp_path / "a", tmp_path / "x")
+    new_model("MO-Hopper-v4").learn(200, undisturbed)
+    resumed = callbacks(tmp_path / "b", tmp_path / "y")
+    gone_on(checkpoints_in(tmp_path / "a")[-2], "MO-Hopper-v4", resumed)
+    ours, theirs = (one.callbacks[0].state_dict() for one in (resumed, undisturbed))
+    for state in (ours, theirs):
+        assert state.pop("evaluation_seconds") > 0
+    assert ours["timesteps"] == [60, 120, 180, 200]
+    assert_same_tree(ours, theirs)
+    assert resumed.callbacks[1].callback.steps == [s for s in undisturbed.callbacks[1].callback.steps if s > 100]
+    with np.load(tmp_path / "y" / "pareto_evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [60, 120, 180, 200]
+
+
+class Counter(BaseCallback):
+    def __init__(self):
+        super().__init__()
+        self.steps = []
+
+    def _on_step(self):
+        self.steps.append(self.num_timesteps)
+        return True
+
+
+def test_a_callback_that_is_missing_is_said(tmp_path):
+    evaluation = ParetoEvalCallback(StubEnv, eval_freq=30, n_preferences=3, n_episodes=1)
+    new_model(StubEnv()).learn(40, [evaluation, MombaCheckpointCallback(20, tmp_path)])
+    model = MOMBA.resume(tmp_path, stub_at(checkpoints_in(tmp_path)[0]))
+    with pytest.warns(UserWarning, match="state of a callback .*ParetoEvalCallback, which is not given now"):
+        model.learn(5, reset_num_timesteps=False)
+
+
+def test_the_number_kept_and_what_they_share(tmp_path):
+    new_model(StubEnv(), buffer_size=64).learn(300, MombaCheckpointCallback(30, tmp_path, keep=3))
+    assert [number_of(folder) for folder in checkpoints_in(tmp_path)] == [10, 9, 8]
+    assert [folder.name for folder in checkpoints_in(tmp_path)] == ["0010-000000300", "0009-000000270", "0008-000000240"]
+    shared = {file.name for file in (tmp_path / "shared").iterdir()}
+    assert shared == {name for folder in checkpoints_in(tmp_path) for name in newest(folder).shared}
+    assert min(rows_of(name)[1] for name in shared) > 240 - 64  # what is overwritten in all of them is gone
+
+
+def test_segments_are_written_once(tmp_path):
+    checkpointed(StubEnv(), tmp_path, 60, 20)
+    before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "shared").iterdir()}
+    gone_on(checkpoints_in(tmp_path)[-1], stub_at(checkpoints_in(tmp_path)[-1]), MombaCheckpointCallback(20, tmp_path, keep=20))
+    after = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "shared").iterdir()}
+    assert {name: after[name] for name in before} == before
+
+
+# -------------------------------------------------------------------------------------------------------------- damage
+
+
+@pytest.fixture
+def three_checkpoints(tmp_path) -> Path:
+    checkpointed(StubEnv(), tmp_path, 60, 20)
+    return tmp_path
+
+
+@pytest.mark.parametrize("file", ["manifest.json", "model.zip", "state.zip"])
+@pytest.mark.parametrize("damage", ["a flipped bit", "truncated", "deleted"])
+def test_a_damaged_checkpoint_is_passed_over_and_named(file, damage, three_checkpoints, caplog):
+    latest, before = checkpoints_in(three_checkpoints)[:2]
+    break_file(latest / file, damage)
+    assert newest(three_checkpoints).folder == before
+    assert file in caplog.text
+    assert damage == "deleted" or file == "manifest.json" or "its manifest states" in caplog.text
+    with pytest.raises(FileFormatError, match=file):
+        MOMBA.resume(latest, StubEnv())
+    assert MOMBA.resume(three_checkpoints, stub_at(before)).num_timesteps == 40
+
+
+def break_file(file: Path, damage: str) -> None:
+    content = bytearray(file.read_bytes())
+    if damage == "deleted":
+        file.unlink()
+    elif damage == "truncated":
+        file.write_bytes(content[: len(content) // 2])
+    else:
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+
+
+def test_a_damaged_segment_condemns_every_checkpoint_that_needs_it(three_checkpoints):
+    first = min((three_checkpoints / "shared").iterdir())
+    break_file(first, "a flipped bit")
+    with pytest.raises(FileFormatError, match=rf"None of the 3 checkpoints in .* is whole.*{first.name}"):
+        newest(three_checkpoints)
+
+
+def test_no_checkpoint_is_said(tmp_path):
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(FileNotFoundError, match="has no checkpoint"):
+            MOMBA.resume(path, StubEnv())
+
+
+def test_another_format_is_named(three_checkpoints):
+    writer = CheckpointWriter(three_checkpoints)
+    folder = writer.write(70, {"other.zip": {"a": 1}}, [])
+    with pytest.raises(FileFormatError, match=r"is not a whole checkpoint: it has no model\.zip"):
+        MOMBA.resume(folder, StubEnv())
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["content"]["version"] = 99
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(FileFormatError, match="checksum"):
+        newest(folder)
+
+
+def test_another_environment_is_refused(three_checkpoints):
+    with pytest.raises(ValueError, match="The model was trained with n_objectives=2"):
+        MOMBA.resume(three_checkpoints, StubEnv(n_objectives=3))
+
+
+def test_settings_that_cannot_be_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="save_freq=0"):
+        MombaCheckpointCallback(0, tmp_path)
+    with pytest.raises(ValueError, match="keep=0"):
+        MombaCheckpointCallback(10, tmp_path, keep=0)
+
+
+# ------------------------------------------------------------------------------------------------------------- signals
+
+SIGNALLED = """
+import os, signal, sys
+from sb3_momba import MombaCheckpointCallback
+from stable_baselines3.common.callbacks import BaseCallback
+from tests.stubs import StubEnv
+from tests.test_checkpoints import new_model
+
+class Signal(BaseCallback):
+    def _on_step(self):
+        if self.num_timesteps == 57:
+            os.kill(os.getpid(), int(sys.argv[2]))
+        return True
+
+new_model(StubEnv()).learn(100_000, [Signal(), MombaCheckpointCallback(50_000, sys.argv[1])])
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_writes_a_checkpoint_and_ends_the_training(number, tmp_path):
+    command = [sys.executable, "-c", SIGNALLED, str(tmp_path), str(int(number))]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == (143 if number == signal.SIGTERM else -signal.SIGINT), ended.stderr
+    checkpoint = newest(tmp_path)
+    assert checkpoint.steps == 57
+    assert MOMBA.resume(tmp_path, stub_at(checkpoint.folder)).num_timesteps == 57
+
+
+def test_handlers_are_the_users_again_after_an_error(tmp_path):
+    class Fails(BaseCallback):
+        def _on_step(self):
+            assert signal.getsignal(signal.SIGINT) is not before
+            raise KeyError
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyError):
+        new_model(StubEnv()).learn(10, [MombaCheckpointCallback(100, tmp_path), Fails()])
+    assert signal.getsignal(signal.SIGINT) is before
+    assert os.listdir(tmp_path) == []
