@@ -60,7 +60,9 @@ VARIANTS = {
         **{"policy": "MlpPolicy", "vector_values": True, "critic_loss": "mse", "her": True},
         "preference_alignment": True,
     },
-    "CAPQL's exploration, a preference per step": {"deterministic_exploration": True, "preference_sampler": PerStepSampler(UniformSampler())},
+    "CAPQL's exploration, a preference per step": {
+        **{"deterministic_exploration": True, "preference_sampler": PerStepSampler(UniformSampler(2))},
+    },
     "3-step returns, four environments": {"n_steps": 3, "n_envs": 4, "gradient_steps": -1},
     "episodes": {"train_freq": (1, "episode"), "gradient_steps": 2},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": "linear"},
