@@ -4,7 +4,8 @@ import time
 
 import torch as th
 
-from sb3_momba.train import RunSettings, report, run
+from sb3_momba.runs import RunSettings, run
+from sb3_momba.train import report
 
 # Networks this small are faster on one thread than on two.
 th.set_num_threads(1)

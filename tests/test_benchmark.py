@@ -19,7 +19,7 @@ import pytest
 import yaml
 from scipy.spatial import ConvexHull
 
-from sb3_momba import records, train
+from sb3_momba import records, runs, train
 from sb3_momba.benchmark import grid, speed
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.grid import Cell, alone_in, has_to_run, make_cells, run_grid
@@ -962,7 +962,7 @@ def test_a_damaged_count_of_parameters_is_one_line_of_error(fake, tmp_path, para
 # ---------------------------------------------------------------------------------------------------------------- grid
 
 
-def parsed(cell: Cell, folder: Path) -> train.RunSettings:
+def parsed(cell: Cell, folder: Path) -> runs.RunSettings:
     """What the training reads from a cell's arguments."""
     return train.parse(cell.arguments(folder))
 
@@ -1178,7 +1178,7 @@ class FakeTraining:
         if outcome == "does not start":
             return SimpleNamespace(returncode=1)
         error = {"fails": BAD, "is cut off": "cut off"}.get(outcome)
-        config = train.recorded_settings(settings)
+        config = runs.recorded_settings(settings)
         write_record(
             folder / "record.jsonl", FRONT if error is None else None, error=error, seed=settings.seed, settings=config
         )
@@ -1254,7 +1254,7 @@ def test_settings_that_no_result_depends_on_may_differ(training, tmp_path) -> No
 def test_what_has_to_run(tmp_path) -> None:
     (cell,) = make_cells(["momba"], [ENV], 1)
     settings = parsed(cell, tmp_path)
-    content = {"settings": train.recorded_settings(settings), "env": ENV}
+    content = {"settings": runs.recorded_settings(settings), "env": ENV}
     ended = {"finished": {"values": FRONT}, "failed": {"error": BAD}, "cut off": {"error": "cut off"}}
     for name, end in ended.items():
         write_record(tmp_path / name / "record.jsonl", **content, **end)

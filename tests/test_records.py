@@ -34,8 +34,9 @@ from sb3_momba.pareto.evaluation import evaluate_front
 from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy, evaluate_floors
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
-from sb3_momba.records import UNENDED, Record, RecordWriter, find_records, is_cut_off_at_its_start, read_record
-from sb3_momba.train import NOT_RECORDED, RunSettings, main, plain, run
+from sb3_momba.records import UNENDED, Record, RecordWriter, find_records, is_cut_off_at_its_start, plain, read_record
+from sb3_momba.runs import NOT_RECORDED, RunSettings, run
+from sb3_momba.train import main
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
 from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
 

@@ -20,8 +20,9 @@ from sb3_momba.benchmark.results import flat
 from sb3_momba.checkpoints.folders import newest
 from sb3_momba.files import FileFormatError
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
+from sb3_momba.runs import CHECKPOINTS, RunSettings, prepared, record_failure, recorded_settings
 from sb3_momba.settings import parse_ent_coef
-from sb3_momba.train import CHECKPOINTS, RunSettings, parse, prepared, record_failure, recorded_settings
+from sb3_momba.train import parse
 from sb3_momba.zoo.configuration import read_configuration
 
 logger = logging.getLogger(__name__)

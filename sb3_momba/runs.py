@@ -1,0 +1,221 @@
+"""Training runs: what a run is set to, how it is made, cut off and gone on with, and what it leaves in its folder.
+
+A run's folder holds the record (settings, curve and final front; `sb3_momba/records.py` says its format), checkpoints, the
+models, the evaluations, the front's picture, and logs as CSV and for TensorBoard.
+"""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat, configure
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_momba.checkpoints.callback import MombaCheckpointCallback
+from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
+from sb3_momba.momba import MOMBA
+from sb3_momba.pareto import protocol
+from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
+from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
+from sb3_momba.pareto.floors import evaluate_floors
+from sb3_momba.pareto.metrics import summarise
+from sb3_momba.records import FILE_NAME as RECORD_NAME
+from sb3_momba.records import RecordWriter, plain, read_record
+from sb3_momba.settings import check_whole
+from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
+
+CHECKPOINTS = "checkpoints"
+# No result depends on them.
+NOT_RECORDED = ("output", "progress_bar", "eval_workers", "checkpoint_freq", "keep_checkpoints")
+
+
+@dataclass
+class RunSettings:
+    """One training run.
+
+    :param label: the method's name in its record and in reports
+    :param hyperparameters: MOMBA's arguments
+    :param env_kwargs: of the environment, such as {"physics": "current"}
+    :param output: the run's folder; must not hold a run already
+    :param eval_freq: environment steps between evaluations
+    :param eval_workers: processes that share an evaluation
+    :param checkpoint_freq: environment steps between checkpoints
+    :param keep_checkpoints: how many of them stay
+    :param reference_point: of the hypervolume; None: the task's in `pareto/protocol.py`
+    """
+
+    env: str
+    output: str
+    steps: int = 1_000_000
+    seed: int = 0
+    label: str = "momba"
+    policy: str = "SimbaPolicy"
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    n_envs: int = 1
+    subprocesses: bool = False
+    eval_freq: int = 50_000
+    n_preferences: int = protocol.N_PREFERENCES
+    n_episodes: int = protocol.N_EPISODES
+    reference_point: list[float] | None = None
+    objectives: list[str] | None = None
+    eval_workers: int = 1
+    checkpoint_freq: int = 10_000
+    keep_checkpoints: int = 2
+    device: str = "auto"
+    progress_bar: bool = True
+
+
+@dataclass
+class RunResult:
+    """What a run left: its front, its metrics over time, those of policies that learned nothing, and its folder."""
+
+    front: ParetoFront
+    timesteps: list[int]
+    metrics: list[dict[str, float]]
+    floors: dict[str, dict[str, float]]
+    folder: Path
+
+
+@dataclass
+class Prepared:
+    """A run that nothing speaks against."""
+
+    model: MOMBA
+    evaluation: ParetoEvalCallback
+    record: RecordWriter
+    preferences: np.ndarray
+    reference_point: Sequence[float]
+
+
+@contextlib.contextmanager
+def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]:
+    """The model, with its environments open, and its evaluation. Nothing is written.
+
+    :param resumed: the model of the newest checkpoint instead of a new one
+    :raises ValueError: for settings that cannot be
+    """
+    check_hyperparameters(settings.policy, settings.hyperparameters)
+    check_whole("steps", settings.steps, 1)
+    folder = Path(settings.output)
+    make_one = partial(make_env, settings.env, settings.env_kwargs)
+    env = make_mo_vec_env(make_one, settings.n_envs, vec_env_cls=SubprocVecEnv if settings.subprocesses else DummyVecEnv)
+    try:
+        reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives_of(env))
+        record = RecordWriter(folder / RECORD_NAME)
+        evaluation = ParetoEvalCallback(
+            make_one,
+            eval_freq=settings.eval_freq,
+            n_preferences=settings.n_preferences,
+            n_episodes=settings.n_episodes,
+            reference_point=reference_point,
+            objectives=settings.objectives,
+            n_workers=settings.eval_workers,
+            log_path=folder,
+            best_model_save_path=folder,
+            callback_after_eval=RecordCallback(record),
+        )
+        if resumed:
+            model = MOMBA.resume(folder / CHECKPOINTS, env, device=settings.device)
+        else:
+            model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
+        evaluation.check(model)
+        preferences = preference_grid(model.n_objectives, settings.n_preferences)
+        yield Prepared(model, evaluation, record, preferences, reference_point)
+    finally:
+        env.close()
+
+
+def run(settings: RunSettings) -> RunResult:
+    """Train, evaluate and write the run's folder."""
+    folder = Path(settings.output)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
+    with prepared(settings) as ready:
+        model, evaluation = ready.model, ready.evaluation
+        sizes = {
+            "actor": sum(p.numel() for p in model.actor.parameters()),
+            "critic": sum(p.numel() for p in model.critic.parameters()),
+        }
+        start = description(settings, ready.preferences, ready.reference_point, sizes)
+        with ready.record.start(**start) as record:
+            for name, front in evaluate_floors(evaluation.eval_env, ready.preferences, settings.n_episodes).items():
+                record.append("floor", policy=name, **front.metrics(ready.reference_point), values=front.values)
+            model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
+            return _train(settings, ready, record, settings.steps)
+
+
+def resume(folder: Path, **running: Any) -> RunResult:
+    """Go on with a run that was cut off, from its newest checkpoint.
+
+    :param running: settings that no result depends on, such as eval_workers
+    :raises ValueError: if there is nothing to go on with
+    """
+    path = folder / RECORD_NAME
+    if not path.is_file():
+        raise ValueError(f"{folder} holds no run: give the folder that a run was started with as its --output.")
+    found = read_record(path)
+    if found.error is None:
+        raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
+    settings = RunSettings(**{**found.config, **running, "output": str(folder)})
+    with prepared(settings, resumed=True) as ready, ready.record.resume(ready.model.num_timesteps) as record:
+        name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
+        ready.model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]))
+        return _train(settings, ready, record, ready.model.remaining_timesteps)
+
+
+def _train(settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int) -> RunResult:
+    folder, model, evaluation = Path(settings.output), ready.model, ready.evaluation
+    checkpoints = MombaCheckpointCallback(settings.checkpoint_freq, folder / CHECKPOINTS, settings.keep_checkpoints)
+    try:
+        callbacks = CallbackList([evaluation, checkpoints])
+        model.learn(steps, callbacks, reset_num_timesteps=model.num_timesteps == 0, progress_bar=settings.progress_bar)
+    finally:
+        model.save(folder / "model.zip")
+    assert evaluation.front is not None
+    record.finish(model.num_timesteps, vars(evaluation.front))
+    floors = {
+        floor.policy: summarise(floor.values, ready.preferences, ready.reference_point)
+        for floor in read_record(record.path).floors
+    }
+    return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, floors, folder)
+
+
+def record_failure(settings: RunSettings, error: str) -> None:
+    """A record in the run's folder of a run that died before it could begin one."""
+    n_objectives = probe_environment(settings.env, settings.env_kwargs).n_objectives
+    reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives)
+    preferences = preference_grid(n_objectives, settings.n_preferences)
+    record = RecordWriter(Path(settings.output) / RECORD_NAME)
+    with contextlib.suppress(RuntimeError), record.start(**description(settings, preferences, reference_point, {})):
+        raise RuntimeError(error)
+
+
+def description(
+    settings: RunSettings, preferences: np.ndarray, reference_point: Sequence[float], parameters: dict[str, int]
+) -> dict[str, Any]:
+    """The first line of a run's record."""
+    return {
+        "label": settings.label,
+        "env": settings.env,
+        "env_kwargs": plain(settings.env_kwargs),
+        "seed": settings.seed,
+        "config": recorded_settings(settings),
+        "reference_point": reference_point,
+        "preferences": preferences,
+        "general_policy": True,
+        "parameters": parameters,
+    }
+
+
+def recorded_settings(settings: RunSettings) -> dict[str, Any]:
+    """Every setting that a result depends on, defaults included, as JSON holds it."""
+    config = {name: value for name, value in asdict(settings).items() if name not in NOT_RECORDED}
+    config["hyperparameters"] = with_defaults(settings.policy, settings.hyperparameters)
+    return dict(plain(config))
