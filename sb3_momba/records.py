@@ -7,7 +7,7 @@ A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has a
   `general_policy`, `parameters` (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
 - `floor`, one for each policy that learned nothing: `policy`, `values` (n, n_objectives) and the metrics.
 - `evaluation`, one for each point of the curve: `steps`, which rise, `seconds` (of training, without evaluations),
-  `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives).
+  `cpu_seconds` (the same, of processor time), `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives).
 - `resumed`, where the run went on from a checkpoint: its `steps` (evaluations after them were made again, and the later ones
   count), `versions`, `machine`, `git_revision` and `started`.
 - `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `returns` and `discounted_returns`
@@ -162,10 +162,12 @@ class Floor:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One point of the curve; `seconds` of training, `values` (n, n_objectives)."""
+    """One point of the curve; `seconds` and `cpu_seconds` (None where they were not noted) of training, `values`
+    (n, n_objectives)."""
 
     steps: int
     seconds: float
+    cpu_seconds: float | None
     values: Array
 
 
@@ -279,7 +281,9 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
             values = _numbers(event["values"], "an evaluation's values", shape)
             if evaluations and event["steps"] <= evaluations[-1].steps:
                 raise FileFormatError(f"its evaluations go from {evaluations[-1].steps} steps to {event['steps']}.")
-            evaluations.append(Evaluation(_whole(event["steps"], "steps"), _finite(event["seconds"], "seconds"), values))
+            cpu_seconds = None if "cpu_seconds" not in event else _finite(event["cpu_seconds"], "cpu_seconds")
+            seconds = _finite(event["seconds"], "seconds")
+            evaluations.append(Evaluation(_whole(event["steps"], "steps"), seconds, cpu_seconds, values))
         elif event["event"] == "end" and event["status"] == "finished":
             returns = _numbers(event["front"]["returns"], "the front's returns", (shape[0], None, shape[1]))
             final_values, error = returns.mean(axis=1), None

@@ -153,7 +153,7 @@ def test_callbacks_go_on_where_they_were(tmp_path):
     gone_on(checkpoints_in(tmp_path / "a")[-2], "MO-Hopper-v4", resumed)
     ours, theirs = (one.callbacks[0].state_dict() for one in (resumed, undisturbed))
     for state in (ours, theirs):
-        assert state.pop("evaluation_seconds") > 0
+        assert min(state.pop("evaluation_seconds").values()) > 0
     assert ours["timesteps"] == [60, 120, 180, 200]
     assert_same_tree(ours, theirs)
     assert resumed.callbacks[1].callback.steps == [s for s in undisturbed.callbacks[1].callback.steps if s > 100]

@@ -192,7 +192,8 @@ def test_seconds_are_of_training_and_evaluations_apart(tmp_path, monkeypatch) ->
         clock[0] += 100
         return evaluate_front(*args, **kwargs)
 
-    monkeypatch.setattr(callbacks, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    clocks = {"seconds": lambda: clock[0], "cpu_seconds": lambda: clock[0] / 2}
+    monkeypatch.setattr(callbacks, "CLOCKS", clocks)
     monkeypatch.setattr(callbacks, "evaluate_front", timed_evaluation)
     writer = writer_of(tmp_path / "record.jsonl")
     callback = ParetoEvalCallback(
@@ -200,8 +201,8 @@ def test_seconds_are_of_training_and_evaluations_apart(tmp_path, monkeypatch) ->
     )
     tiny_model(Timed(), learning_starts=100).learn(30, callback=callback)
     evaluations = [line for line in lines_of(writer.path) if line["event"] == "evaluation"]
-    times = [(line["steps"], line["seconds"], line["evaluation_seconds"]) for line in evaluations]
-    assert times == [(10, 10, 100), (20, 20, 200), (30, 30, 300)]
+    times = [[line[name] for name in ("steps", "seconds", "cpu_seconds", "evaluation_seconds")] for line in evaluations]
+    assert times == [[10, 10, 5, 100], [20, 20, 10, 200], [30, 30, 15, 300]]
 
 
 def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:
