@@ -93,6 +93,13 @@ def test_no_compiler_is_said_before_training(monkeypatch):
     MOMBA("SimbaPolicy", StubEnv(), policy_kwargs=TINY_SIMBA)
 
 
+def test_training_mode_reaches_every_module():
+    policy = filled_model(policy_kwargs=TINY_SIMBA).policy
+    for mode in (True, False, False, True):
+        policy.set_training_mode(mode)
+        assert {module.training for module in policy.modules()} == {mode}
+
+
 @pytest.mark.parametrize(("policy", "kwargs"), [("SimbaPolicy", TINY_SIMBA), ("MlpPolicy", TINY_MLP)])
 def test_the_actor_loss_asks_for_no_gradients_of_the_critics_weights(policy, kwargs):
     model = filled_model(policy, policy_kwargs=kwargs)
