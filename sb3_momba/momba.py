@@ -448,7 +448,7 @@ def move_towards(target: th.nn.Module, network: th.nn.Module, tau: float) -> Non
 
 
 class NonFiniteLossError(ArithmeticError):
-    """A loss is NaN or infinite; it changed nothing of its network."""
+    """A loss or its gradient is NaN or infinite; it changed nothing of its network."""
 
 
 def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
@@ -458,4 +458,8 @@ def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     optimizer.zero_grad(set_to_none=True)
     loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
+    norm = th.stack(th._foreach_norm([p.grad for p in parameters if p.grad is not None])).norm()
+    if not th.isfinite(norm):
+        optimizer.zero_grad(set_to_none=True)
+        raise NonFiniteLossError(f"its loss is {loss.item():g}, the norm of its gradient {norm.item()}.")
     optimizer.step()

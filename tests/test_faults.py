@@ -776,6 +776,22 @@ def with_losses(original, losses):
     return loss_of
 
 
+def test_row_27_a_gradient_that_is_not_a_number_is_skipped_too(caplog):
+    model = tiny_model(StubEnv()).learn(30)
+    good = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    original = model._critic_loss
+
+    def steep_loss(batch, alpha):
+        loss, metrics = original(batch, alpha)
+        zero = sum(parameter.sum() for parameter in model.critic.parameters()) * 0
+        return loss + zero.sqrt(), metrics  # finite, but not its slope
+
+    model._critic_loss = steep_loss
+    model.train(1, 8)
+    assert "the norm of its gradient nan" in caplog.text
+    assert all(th.equal(good[name], tensor) for name, tensor in model.policy.state_dict().items())
+
+
 def test_row_27_an_absurd_learning_rate_ends_in_finite_parameters_or_an_error():
     model = tiny_model(StubEnv(), policy="MlpPolicy", critic_loss="mse", learning_rate=1e6)
     try:
