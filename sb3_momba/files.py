@@ -20,6 +20,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import BaseBuffer
@@ -29,6 +34,7 @@ TRUSTED_ROOTS = ("torch", "stable_baselines3", "sb3_momba")
 NAMEABLE_BASES = (nn.Module, th.optim.Optimizer, BaseBuffer)
 ARRAY_KINDS = "biuf"
 LONGEST_NAME = 120
+LOCK = ".lock"
 
 FilePath = str | os.PathLike[str] | io.BufferedIOBase
 
@@ -83,6 +89,22 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and error.filename == os.fspath(aside):
             raise type(error)(error.errno, error.strerror, os.fspath(path)) from error
         raise
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """The only process that writes into a folder, which is made if need be. (Not watched over on Windows.)
+
+    :raises ValueError: if another one does
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "w") as lock:
+        if fcntl is not None:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ValueError(f"Another process writes into {folder}: wait for it, or choose another folder.") from error
+        yield
 
 
 def write_tree(path: FilePath, tree: Any) -> list[str]:

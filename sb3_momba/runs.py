@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
+from sb3_momba.files import LOCK, alone_in
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
@@ -135,9 +136,9 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
 def run(settings: RunSettings) -> RunResult:
     """Train, evaluate and write the run's folder."""
     folder = Path(settings.output)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or any(file.name != LOCK for file in folder.iterdir())):
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
-    with prepared(settings) as ready:
+    with prepared(settings) as ready, alone_in(folder):
         model, evaluation = ready.model, ready.evaluation
         sizes = {
             "actor": sum(p.numel() for p in model.actor.parameters()),
@@ -164,7 +165,11 @@ def resume(folder: Path, **running: Any) -> RunResult:
     if found.error is None:
         raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
     settings = RunSettings(**{**found.config, **running, "output": str(folder)})
-    with prepared(settings, resumed=True) as ready, ready.record.resume(ready.model.num_timesteps) as record:
+    with (
+        alone_in(folder),
+        prepared(settings, resumed=True) as ready,
+        ready.record.resume(ready.model.num_timesteps) as record,
+    ):
         name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
         ready.model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]))
         return _train(settings, ready, record, ready.model.remaining_timesteps)

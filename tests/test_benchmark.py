@@ -22,12 +22,12 @@ from scipy.spatial import ConvexHull
 from sb3_momba import records, runs, train
 from sb3_momba.benchmark import grid, speed
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.grid import Cell, alone_in, has_to_run, make_cells, run_grid
+from sb3_momba.benchmark.grid import Cell, has_to_run, make_cells, run_grid
 from sb3_momba.benchmark.report import median_run, write_report
 from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text
-from sb3_momba.files import FileFormatError
+from sb3_momba.files import FileFormatError, alone_in
 from sb3_momba.pareto.metrics import convex_envelope, non_dominated
 from sb3_momba.records import UNENDED, Record, RecordWriter, read_record
 from tests.stubs import TINY_SIMBA
@@ -1120,7 +1120,7 @@ def test_a_second_grid_on_the_same_folder_is_refused_while_one_runs(training, tm
 
     def run_meanwhile(command: list[str], **kwargs: Any) -> SimpleNamespace:
         monkeypatch.setattr(subprocess, "run", fake_training)
-        with pytest.raises(ValueError, match="Another grid runs in") as error:
+        with pytest.raises(ValueError, match="Another process writes into") as error:
             run_grid(second, tmp_path / "grid")
         refusals.append(str(error.value))
         refusals.append(error_of("run", "--conf", "capql", "--env", ENV, "--seeds", "1", "--output", tmp_path / "grid"))
@@ -1130,7 +1130,7 @@ def test_a_second_grid_on_the_same_folder_is_refused_while_one_runs(training, tm
     monkeypatch.setattr(subprocess, "run", run_meanwhile)
     assert len(run_grid(first, tmp_path / "grid")) == 0
     assert len(refusals) == 2
-    assert all(f"Another grid runs in {tmp_path / 'grid'}" in refusal for refusal in refusals)
+    assert all(f"Another process writes into {tmp_path / 'grid'}" in refusal for refusal in refusals)
     assert not (tmp_path / "grid" / "capql").exists()
     assert len(run_grid(second, tmp_path / "grid")) == 0
     assert len(fake_training.seeds) == 3
@@ -1147,7 +1147,7 @@ def test_a_grid_that_was_killed_does_not_bar_the_next_one(training, tmp_path) ->
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        with pytest.raises(ValueError, match="Another grid runs in"):
+        with pytest.raises(ValueError, match="Another process writes into"):
             run_grid(cells, tmp_path)
         other.kill()
     assert len(run_grid(cells, tmp_path)) == 0

@@ -18,7 +18,7 @@ from sb3_momba.buffers import STORED_ARRAYS
 from sb3_momba.checkpoints.folders import CheckpointWriter, checkpoints_in, newest, number_of
 from sb3_momba.checkpoints.replay_segments import rows_of
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler
-from sb3_momba.files import FileFormatError, read_tree
+from sb3_momba.files import FileFormatError, alone_in, read_tree
 from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv, assert_same_tree
 
 SETTINGS = {"seed": 0, "learning_starts": 30, "batch_size": 16, "buffer_size": 150, "device": "cpu"}
@@ -305,4 +305,10 @@ def test_handlers_are_the_users_again_after_an_error(tmp_path):
     with pytest.raises(KeyError):
         new_model(StubEnv()).learn(10, [MombaCheckpointCallback(100, tmp_path), Fails()])
     assert signal.getsignal(signal.SIGINT) is before
-    assert os.listdir(tmp_path) == []
+    assert os.listdir(tmp_path) == [".lock"]
+
+
+def test_two_trainings_in_one_folder_are_refused(tmp_path):
+    with alone_in(tmp_path), pytest.raises(ValueError, match="Another process writes into"):
+        new_model(StubEnv()).learn(5, MombaCheckpointCallback(100, tmp_path))
+    new_model(StubEnv()).learn(5, MombaCheckpointCallback(100, tmp_path))

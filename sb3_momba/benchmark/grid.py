@@ -4,21 +4,19 @@ A cell whose run ended, well or badly, is not run again; one that was cut off is
 """
 
 import argparse
-import contextlib
-import fcntl
 import logging
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_momba.benchmark.results import flat
 from sb3_momba.checkpoints.folders import newest
-from sb3_momba.files import FileFormatError
+from sb3_momba.files import LOCK, FileFormatError, alone_in
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
 from sb3_momba.runs import CHECKPOINTS, RunSettings, prepared, record_failure, recorded_settings
 from sb3_momba.settings import parse_ent_coef
@@ -100,17 +98,6 @@ def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_fail
     return [cell.name for cell in cells if read_record(output / cell.name / FILE_NAME).error is not None]
 
 
-@contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """:raises ValueError: if another process is in here with the same folder"""
-    with open(folder / ".lock", "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"Another grid runs in {folder}: wait for it, or choose another --output.") from error
-        yield
-
-
 def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) -> bool:
     """Whether a cell never ran or was cut off.
 
@@ -118,7 +105,7 @@ def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) 
     """
     record = folder / FILE_NAME
     if not record.exists() or is_cut_off_at_its_start(record):
-        if folder.exists() and (not folder.is_dir() or any(file.name != FILE_NAME for file in folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or any(file.name not in (FILE_NAME, LOCK) for file in folder.iterdir())):
             raise ValueError(f"{folder} holds something else than a run: choose another --output.")
         return True
     found, wanted = read_record(record), recorded_settings(settings)

@@ -1,5 +1,6 @@
 """Checkpoints while training."""
 
+import contextlib
 import os
 import signal
 import threading
@@ -11,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_momba.checkpoints.checkpoint import write_checkpoint
 from sb3_momba.checkpoints.folders import CheckpointWriter
+from sb3_momba.files import alone_in
 
 if TYPE_CHECKING:
     from sb3_momba.momba import MOMBA
@@ -22,7 +24,8 @@ class MombaCheckpointCallback(BaseCallback):
     """Write everything that the training is into `path`, every `save_freq` environment steps and at its end.
 
     `MOMBA.resume(path, env)` goes on from the newest checkpoint that is whole. SIGINT (Ctrl-C) and SIGTERM write one too, and
-    then end the training by KeyboardInterrupt and SystemExit; a second signal does not wait for it.
+    then end the training by KeyboardInterrupt and SystemExit; a second signal does not wait for it. Only one training at a time
+    writes into a folder.
 
     :param save_freq: environment steps, over all training environments
     :param path: folder of the checkpoints
@@ -42,6 +45,7 @@ class MombaCheckpointCallback(BaseCallback):
         self.writer = CheckpointWriter(path, keep)
         self.segments: list[str] = []
         self.received: int | None = None
+        self.lock = contextlib.ExitStack()
         self.handlers: dict[int, Any] = {}
 
     def _init_callback(self) -> None:
@@ -53,6 +57,7 @@ class MombaCheckpointCallback(BaseCallback):
         self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
 
     def _on_training_start(self) -> None:
+        self.lock.enter_context(alone_in(self.path))
         self.root: BaseCallback = self.locals["callback"]
         if threading.current_thread() is threading.main_thread():
             self.handlers = {number: signal.signal(number, self._note) for number in SIGNALS}
@@ -82,6 +87,7 @@ class MombaCheckpointCallback(BaseCallback):
     def after_learn(self) -> None:
         """However `learn` has ended."""
         self._restore_handlers()
+        self.lock.close()
 
     def _on_training_end(self) -> None:
         if self.saved_at < self.model.num_timesteps:
