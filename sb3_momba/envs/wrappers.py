@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
+from sb3_momba.envs.workers import WatchedSubprocVecEnv
 
 LARGEST_REWARD = 1e10
 LONGEST_REPLAY = 20_000  # actions of an episode that are noted
@@ -332,6 +333,7 @@ def make_mo_vec_env(
     :param env: id or callable that makes a new environment
     :param seed: environment i starts with seed + i
     :param preference_sampler: for every copy; each has its own random stream
+    :param vec_env_cls: with SubprocVecEnv, processes are watched over: see WatchedSubprocVecEnv
     """
     if isinstance(env, gym.Env):
         raise ValueError("make_mo_vec_env needs an id or a callable that makes new environments, not one environment.")
@@ -347,6 +349,7 @@ def make_mo_vec_env(
 
         return make
 
+    vec_env_cls = WatchedSubprocVecEnv if vec_env_cls is SubprocVecEnv else vec_env_cls
     venv = vec_env_cls([maker(i) for i in range(n_envs)], **(vec_env_kwargs or {}))
     if seed is not None:
         venv.seed(seed)
