@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.checkpoints.training_state import set_states_of_callbacks
+from sb3_momba.diagnostics import forgive_full_disks
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
 from sb3_momba.policies import MombaPolicy
@@ -139,6 +140,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         self.replay_buffer.check_memory()
         total_timesteps, root = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._root_callback = root
+        forgive_full_disks(self.logger)
         if self._states_of_callbacks is not None:
             set_states_of_callbacks(root, self._states_of_callbacks)
             self._states_of_callbacks = None

@@ -1,6 +1,9 @@
 """Metrics of the training: added up as tensors, turned into numbers only when the log is written."""
 
+import logging
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -10,6 +13,8 @@ from torch import nn
 BLIND_UPDATES = 1_000
 
 Metrics = dict[str, th.Tensor]
+
+logger = logging.getLogger(__name__)
 
 
 class TrainingMetrics:
@@ -45,6 +50,29 @@ class TrainingMetrics:
             for i, number in enumerate(mean):
                 logger.record(f"train/{name}" + (f"_{i}" if len(mean) > 1 else ""), float(number))
         self.sums, self.count = {}, 0
+
+
+def forgive_full_disks(log: Logger) -> None:
+    """A log that cannot be written is said once, and does not end a training."""
+    for output in log.output_formats:
+        write = output.write
+        if not isinstance(write, ForgivingWrite):
+            output.write = ForgivingWrite(write)  # type: ignore[method-assign]
+
+
+class ForgivingWrite:
+    def __init__(self, write: Callable[..., None]):
+        self.write = write
+        self.warned = False
+
+    def __call__(self, *args: Any, **kwargs: Any) -> None:
+        try:
+            self.write(*args, **kwargs)
+        except OSError as error:
+            if not self.warned:
+                self.warned = True
+                owner = type(getattr(self.write, "__self__", None)).__name__
+                logger.warning("A log (%s) cannot be written: %s. The training goes on without it.", owner, error)
 
 
 class NegativeReturnWatch:

@@ -28,6 +28,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
@@ -799,3 +800,17 @@ def test_row_27_an_absurd_learning_rate_ends_in_finite_parameters_or_an_error():
     except NonFiniteLossError as error:
         assert "diverges" in str(error)  # noqa: PT017
     assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+class FullDisk(KVWriter):
+    def write(self, key_values, key_excluded, step=0):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_row_30_a_full_disk_in_the_logs_is_said_once(caplog, tmp_path):
+    model = tiny_model(StubEnv())
+    model.set_logger(Logger(None, [FullDisk(), CSVOutputFormat(str(tmp_path / "progress.csv"))]))
+    model.learn(100, log_interval=1)
+    assert model.num_timesteps == 100
+    assert caplog.text.count("A log (FullDisk) cannot be written: [Errno 28] No space left on device") == 1
+    assert len((tmp_path / "progress.csv").read_text().splitlines()) > 5
