@@ -293,7 +293,7 @@ def _find_class(name: str) -> type:
 
 def _write_archive(file: BinaryIO, text: str, arrays: dict[str, np.ndarray]) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr("tree.json", text)
+        archive.writestr(zipfile.ZipInfo("tree.json"), text)  # without the time: one tree is always the same bytes
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)

@@ -83,7 +83,7 @@ def test_going_on_from_any_checkpoint_is_never_having_stopped(kwargs, tmp_path):
     assert_same_tree(everything(observed), undisturbed)
     folders = checkpoints_in(tmp_path)
     assert len(folders) >= 2
-    for folder in folders:
+    for folder in folders[::2]:
         resumed = gone_on(folder, make_mo_vec_env(env, n_envs))
         assert_same_tree(everything(resumed), undisturbed)
 
@@ -103,7 +103,7 @@ def test_going_on_in_processes_of_their_own(tmp_path):
 
 def test_a_buffer_that_has_gone_round_many_times(tmp_path):
     undisturbed = everything(checkpointed(StubEnv(), tmp_path, 500, 40, buffer_size=64))
-    for folder in checkpoints_in(tmp_path):
+    for folder in checkpoints_in(tmp_path)[::4]:
         assert_same_tree(everything(gone_on(folder, stub_at(folder))), undisturbed)
 
 
