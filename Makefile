@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test lint known-fronts first-records rounding speed clean
+.PHONY: demo test lint known-fronts first-records evidence rounding speed clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -26,6 +26,14 @@ first-records: $(VENV)/installed
 	$(BIN)/python -m sb3_momba.benchmark run --conf momba capql capql_uniform --env MO-HalfCheetah-v4 MO-Hopper-v4 \
 		--seeds 2 --steps 3e4 --eval-freq 5e3 --auto-ent-coef 0.01 --output runs/first
 	$(BIN)/python -m sb3_momba.benchmark report runs/first
+
+EVIDENCE := --env MO-HalfCheetah-v4 MO-Hopper-v4 MO-Walker2d-v4 --seeds 4 --steps 5e4 --eval-freq 5e3
+
+evidence: $(VENV)/installed
+	$(BIN)/python -m sb3_momba.benchmark run --conf capql capql_uniform $(EVIDENCE) --output runs/evidence/baselines
+	$(BIN)/python -m sb3_momba.benchmark run --conf momba her_par $(EVIDENCE) --auto-ent-coef 0.01 \
+		--set precision=auto --set compile=true --output runs/evidence/momba
+	$(BIN)/python -m sb3_momba.benchmark report runs/evidence
 
 rounding: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m tests.rounding
