@@ -35,6 +35,7 @@ NAMEABLE_BASES = (nn.Module, th.optim.Optimizer, BaseBuffer)
 ARRAY_KINDS = "biuf"
 LONGEST_NAME = 120
 LOCK = ".lock"
+WRONG_CONTENT = (KeyError, TypeError, IndexError, AttributeError, OverflowError, RuntimeError)
 
 FilePath = str | os.PathLike[str] | io.BufferedIOBase
 
@@ -151,6 +152,18 @@ def read_tree(path: FilePath) -> tuple[Any, list[str]]:
         raise FileFormatError(f"{name}: {error}") from error
     except Exception as error:
         raise FileFormatError(f"{name} is damaged, or not a file of sb3_momba: {type(error).__name__}: {error}") from error
+
+
+@contextlib.contextmanager
+def content_of(path: FilePath) -> Iterator[None]:
+    """Inside, a file's content is used: what it does not fit is an error that names the file.
+
+    :raises FileFormatError: in place of errors that content of a wrong type or shape leads to
+    """
+    try:
+        yield
+    except WRONG_CONTENT as error:
+        raise FileFormatError(f"{path} does not hold what it should: {type(error).__name__}: {error}") from error
 
 
 def with_suffix(path: FilePath, suffix: str) -> FilePath:

@@ -20,7 +20,17 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
 from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler
 from sb3_momba.envs.wrappers import n_objectives_of
-from sb3_momba.files import FileFormatError, FilePath, read_tree, register, with_existing_suffix, with_suffix, write_tree
+from sb3_momba.files import (
+    WRONG_CONTENT,
+    FileFormatError,
+    FilePath,
+    content_of,
+    read_tree,
+    register,
+    with_existing_suffix,
+    with_suffix,
+    write_tree,
+)
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.settings import nearest
 from sb3_momba.system import library_versions
@@ -103,7 +113,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
                 "changed at load."
             )
         for place in tree["left_out"]:
-            name = place.split(".")[1]
+            name = place.partition(".")[2].partition(".")[0]
             if name not in (custom_objects or {}) and name not in kwargs:
                 warnings.warn(
                     f"{place.removeprefix('data.')} was not stored: pass custom_objects={{{name!r}: ...}} to have it back; the "
@@ -123,13 +133,15 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             data["n_envs"] = env.num_envs
             if force_reset:
                 data["_last_obs"] = None
-        model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg, arg-type]
+        with content_of(path):
+            model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg, arg-type]
         model.__dict__.update(data)
         unknown = [name for name in kwargs if name not in model.__dict__]
         if unknown:
             raise ValueError(f"{cls.__name__} has no setting {unknown[0]!r}{nearest(unknown[0], model.__dict__)}")
         model.__dict__.update(kwargs)
-        model._setup_model()
+        with content_of(path):
+            model._setup_model()
         if ("ent_coef_optimizer" in tree["params"]) != (model.ent_coef_optimizer is not None):
             raise ValueError(
                 f"ent_coef={model.ent_coef!r}: a learned entropy coefficient cannot become a fixed one at load, or back."
@@ -138,7 +150,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             model.set_parameters(tree["params"], exact_match=True, device=device)
             for name, tensor in tree["tensors"].items():
                 recursive_getattr(model, name).data.copy_(tensor)
-        except (RuntimeError, KeyError, AttributeError, ValueError) as error:
+        except (*WRONG_CONTENT, ValueError) as error:
             changed = f" as changed by {kwargs}" if kwargs else ""
             raise FileFormatError(f"{path} holds parameters that do not fit its own settings{changed}: {error}") from error
         return model
@@ -151,7 +163,9 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     ) -> None:
         """Load parameters from a file of ours, or from a dictionary as `get_parameters` gives it."""
         if isinstance(load_path_or_dict, str | os.PathLike | io.IOBase):
-            load_path_or_dict = read_model(load_path_or_dict)["params"]
+            with content_of(load_path_or_dict):  # type: ignore[arg-type]
+                super().set_parameters(read_model(load_path_or_dict)["params"], exact_match, device)
+            return
         super().set_parameters(load_path_or_dict, exact_match, device)
 
     def save_replay_buffer(self, path: FilePath) -> None:  # type: ignore[override]
@@ -174,15 +188,21 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         :raises ValueError: if they are of another environment
         """
         tree = read_format(with_existing_suffix(path, ".npz"), BUFFER_FORMAT)
-        self._check_buffer_fits(tree)
-        self.buffer_size = tree["buffer_size"] * tree["n_envs"]
-        buffer = self._make_replay_buffer()
-        for name in STORED_ARRAYS:
-            array = tree["arrays"][name]
-            getattr(buffer, name)[: len(array)] = array
-        buffer.pos, buffer.full = tree["pos"], tree["full"]
-        buffer.n_added = buffer.pos + (buffer.buffer_size if buffer.full else 0)
-        buffer.rng.bit_generator.state = tree["rng"]
+        size_before = self.buffer_size
+        try:
+            with content_of(path):
+                self._check_buffer_fits(tree)
+                self.buffer_size = tree["buffer_size"] * tree["n_envs"]
+                buffer = self._make_replay_buffer()
+                for name in STORED_ARRAYS:
+                    array = tree["arrays"][name]
+                    getattr(buffer, name)[: len(array)] = array
+                buffer.pos, buffer.full = tree["pos"], tree["full"]
+                buffer.n_added = buffer.pos + (buffer.buffer_size if buffer.full else 0)
+                buffer.rng.bit_generator.state = tree["rng"]
+        except BaseException:
+            self.buffer_size = size_before
+            raise
         if truncate_last_traj:
             buffer.end_episodes()
         self.replay_buffer = buffer
@@ -241,8 +261,11 @@ def pickled_by_sb3(path: FilePath) -> bool:
     """Whether a file is a zip as Stable-Baselines3 writes it."""
     if not zipfile.is_zipfile(path):  # type: ignore[arg-type]
         return False
-    with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
-        names = archive.namelist()
+    try:
+        with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
+            names = archive.namelist()
+    except zipfile.BadZipFile:  # damaged, as its reader will say
+        return False
     return "_stable_baselines3_version" in names and "tree.json" not in names
 
 

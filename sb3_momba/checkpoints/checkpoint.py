@@ -16,7 +16,7 @@ from sb3_momba.checkpoints.training_state import (
     states_of_callbacks,
     statistics_of,
 )
-from sb3_momba.files import FileFormatError, read_tree
+from sb3_momba.files import FileFormatError, content_of, read_tree
 
 if TYPE_CHECKING:
     from sb3_momba.momba import MOMBA
@@ -53,16 +53,16 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
     if missing:
         raise FileFormatError(f"{checkpoint.folder} is not a whole checkpoint: it has no {missing[0]}.")
     model = cls.load(checkpoint.folder / MODEL, env, force_reset=False, **kwargs)
-    try:
-        state, _ = read_tree(checkpoint.folder / STATE)
+    state, _ = read_tree(checkpoint.folder / STATE)
+    with content_of(checkpoint.folder):
         read_segments(model.replay_buffer, checkpoint, state["buffer"])
         set_statistics(model, state["statistics"])
-        _bring_back_environments(model, state["environments"])
+        environments_then = state["environments"]
+    _bring_back_environments(model, environments_then)
+    with content_of(checkpoint.folder):
         set_random_states(model, state["random"])
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise FileFormatError(f"{checkpoint.folder} is not a whole checkpoint: {type(error).__name__}: {error}") from error
+        model._states_of_callbacks = state["callbacks"]
     model._resumed_from = checkpoint
-    model._states_of_callbacks = state["callbacks"]
     return model
 
 

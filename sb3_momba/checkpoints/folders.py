@@ -106,9 +106,13 @@ def read_manifest(folder: Path) -> Checkpoint:
         found = hashlib.sha256(canonical(content)).hexdigest()
         checkpoint = Checkpoint(folder, *(content[name] for name in ("steps", "files", "shared")))
         is_ours = content["format"] == FORMAT and content["version"] == VERSION
+        if not all(set(one) == {"bytes", "sha256"} for one in checkpoint.files.values()):
+            raise TypeError("an entry of its files has no length and checksum")
+        if not all(isinstance(name, str) for name in checkpoint.shared):
+            raise TypeError("a shared file's name is no text")
     except FileNotFoundError as error:
         raise FileFormatError(f"{file} is missing.") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FileFormatError(f"{file} is damaged: {type(error).__name__}: {error}") from error
     if found != stated:
         raise FileFormatError(f"{file} has the checksum {found} where it states {stated}.")

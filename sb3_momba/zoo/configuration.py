@@ -85,7 +85,7 @@ def literal(value: Any) -> Any:
 
 def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
     """:raises ValueError: for names that MOMBA or the policy do not take, with the nearest that they do"""
-    if policy not in POLICIES:
+    if not isinstance(policy, str) or policy not in POLICIES:
         raise ValueError(f"The policy {policy!r} is not known{nearest(policy, POLICIES)}")
     known = [name for name in parameters(MOMBA) if name not in NOT_FOR_CONFIGURATIONS]
     for name in hyperparameters:
