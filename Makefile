@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test lint known-fronts first-records evidence rounding speed clean
+.PHONY: demo test lint known-fronts first-records evidence rounding speed torture clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -37,6 +37,9 @@ evidence: $(VENV)/installed
 
 rounding: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m tests.rounding
+
+torture: $(VENV)/tools
+	$(ONE_THREAD) $(BIN)/python -m tests.torture
 
 speed: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark speed --threads 1

@@ -1,0 +1,20 @@
+"""The short form of tests/torture.py: kills, full disks, damaged and malicious files, resumption."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Processes are forked, killed and limited.")
+
+
+@pytest.mark.parametrize("part", ["kill", "operations", "resume", "mutate", "disk"])
+def test_every_promise_holds(part):
+    # In a process of its own: one that has computed on several threads could not be forked.
+    command = [sys.executable, "-m", "tests.torture", part, "--counts", "short"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    root = Path(__file__).parent.parent
+    ended = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
