@@ -57,9 +57,7 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
     with content_of(checkpoint.folder):
         read_segments(model.replay_buffer, checkpoint, state["buffer"])
         set_statistics(model, state["statistics"])
-        environments_then = state["environments"]
-    _bring_back_environments(model, environments_then)
-    with content_of(checkpoint.folder):
+        _bring_back_environments(model, state["environments"])
         set_random_states(model, state["random"])
         model._states_of_callbacks = state["callbacks"]
     model._resumed_from = checkpoint
