@@ -21,6 +21,7 @@ from sb3_momba.checkpoints.training_state import callbacks_below
 from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
+from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
@@ -309,7 +310,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         dtype = product_dtype(self.precision, self.device)
         return th.autocast(self.device.type, dtype, enabled=dtype != th.float32)  # type: ignore[return-value]
 
-    def _skip_update(self, error: "NonFiniteLossError") -> None:
+    def _skip_update(self, error: NonFiniteLossError) -> None:
         """Go on after a bad loss; give up after many in a row, each network as its last good step left it."""
         self._skipped_updates += 1
         if self._skipped_updates >= MAX_SKIPPED_UPDATES:
@@ -439,27 +440,3 @@ class MOMBA(PreferenceConditionedAlgorithm):
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
     """u_w(v) = w.v (Definition 3): the last dimension, n_objectives, is summed away."""
     return (preferences * values).sum(dim=-1)
-
-
-@th.no_grad()
-def move_towards(target: th.nn.Module, network: th.nn.Module, tau: float) -> None:
-    """target <- (1 - tau) target + tau network, all parameters in one call (Algorithm 1)."""
-    th._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
-
-
-class NonFiniteLossError(ArithmeticError):
-    """A loss or its gradient is NaN or infinite; it changed nothing of its network."""
-
-
-def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
-    """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
-    if not th.isfinite(loss):
-        raise NonFiniteLossError(f"its loss is {loss.item()}.")
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
-    norm = th.stack(th._foreach_norm([p.grad for p in parameters if p.grad is not None])).norm()
-    if not th.isfinite(norm):
-        optimizer.zero_grad(set_to_none=True)
-        raise NonFiniteLossError(f"its loss is {loss.item():g}, the norm of its gradient {norm.item()}.")
-    optimizer.step()

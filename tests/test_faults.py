@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_momba import MOMBA, PreferenceWrapper, files, make_mo_vec_env
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, check_preference
 from sb3_momba.files import FileFormatError, read_tree
-from sb3_momba.momba import NonFiniteLossError
+from sb3_momba.nn.descent import NonFiniteLossError
 from sb3_momba.saving import PickleFreeSaving
 from tests.stubs import StubEnv, assert_same_tree, observation_of, reward_of, tiny_model
 

@@ -1,0 +1,27 @@
+"""One step of an optimiser, and of a target network."""
+
+import torch as th
+
+
+@th.no_grad()
+def move_towards(target: th.nn.Module, network: th.nn.Module, tau: float) -> None:
+    """target <- (1 - tau) target + tau network, all parameters in one call (Algorithm 1)."""
+    th._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+
+
+class NonFiniteLossError(ArithmeticError):
+    """A loss or its gradient is NaN or infinite; it changed nothing of its network."""
+
+
+def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+    """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
+    if not th.isfinite(loss):
+        raise NonFiniteLossError(f"its loss is {loss.item()}.")
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
+    norm = th.stack(th._foreach_norm([p.grad for p in parameters if p.grad is not None])).norm()
+    if not th.isfinite(norm):
+        optimizer.zero_grad(set_to_none=True)
+        raise NonFiniteLossError(f"its loss is {loss.item():g}, the norm of its gradient {norm.item()}.")
+    optimizer.step()
