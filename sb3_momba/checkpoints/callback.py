@@ -43,7 +43,6 @@ class MombaCheckpointCallback(BaseCallback):
         self.save_freq = int(save_freq)
         self.path = Path(path)
         self.writer = CheckpointWriter(path, keep)
-        self.segments: list[str] = []
         self.received: int | None = None
         self.lock = contextlib.ExitStack()
         self.handlers: dict[int, Any] = {}
@@ -52,7 +51,6 @@ class MombaCheckpointCallback(BaseCallback):
         resumed_from = self.model._resumed_from
         if resumed_from is not None and resumed_from.folder.parent.resolve() == self.path.resolve():
             self.writer.go_on_from(resumed_from)
-            self.segments = list(resumed_from.shared)
         self.saved_at = self.model.num_timesteps
         self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
 
@@ -95,7 +93,7 @@ class MombaCheckpointCallback(BaseCallback):
 
     def save(self) -> None:
         """Write a checkpoint now."""
-        self.segments = write_checkpoint(self.model, self.writer, self.segments, self.root)
+        write_checkpoint(self.model, self.writer, self.root)
         self.saved_at = self.model.num_timesteps
         if self.verbose >= 1:
             print(f"Checkpoint at {self.saved_at:,} steps in {self.path}")

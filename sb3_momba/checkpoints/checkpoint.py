@@ -26,15 +26,13 @@ MODEL, STATE = "model.zip", "state.zip"
 Model = TypeVar("Model", bound="MOMBA")
 
 
-def write_checkpoint(model: "MOMBA", writer: CheckpointWriter, segments: list[str], callback: BaseCallback | None) -> list[str]:
+def write_checkpoint(model: "MOMBA", writer: CheckpointWriter, callback: BaseCallback | None) -> None:
     """Between two rollouts, when the last transition is stored and its updates are made.
 
-    :param segments: those of the checkpoint before
     :param callback: the root of the training's callbacks
-    :return: the segments that belong to this checkpoint
     """
     assert model.env is not None
-    segments, buffer = write_segments(model.replay_buffer, writer, segments)
+    segments, buffer = write_segments(model.replay_buffer, writer)
     state = {
         "random": random_states(model),
         "buffer": buffer,
@@ -43,7 +41,6 @@ def write_checkpoint(model: "MOMBA", writer: CheckpointWriter, segments: list[st
         "callbacks": states_of_callbacks(callback),
     }
     writer.write(model.num_timesteps, {MODEL: model.tree(), STATE: state}, segments)
-    return segments
 
 
 def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Model:

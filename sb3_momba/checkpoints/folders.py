@@ -135,7 +135,7 @@ class CheckpointWriter:
         self.root = Path(root)
         self.keep = keep
         self.shared_folder = self.root / SHARED
-        self.checksums: dict[str, dict[str, Any]] = {}
+        self.checksums: dict[str, dict[str, Any]] = {}  # of the shared files, in the order in which they were written
 
     def go_on_from(self, checkpoint: Checkpoint) -> None:
         """Let the next checkpoint use the shared files of this one."""

@@ -29,18 +29,15 @@ def rows_of(name: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def write_segments(
-    buffer: PreferenceReplayBuffer, writer: CheckpointWriter, written: list[str]
-) -> tuple[list[str], dict[str, Any]]:
+def write_segments(buffer: PreferenceReplayBuffer, writer: CheckpointWriter) -> tuple[list[str], dict[str, Any]]:
     """Write what no segment holds yet.
 
     The newest row is no part of them: it still changes where its episode is ended from outside.
 
-    :param written: the segments of the checkpoint before
     :return: the segments that belong to this checkpoint, and the rest of the buffer's state
     """
     oldest, last = buffer.n_added - buffer.size(), max(buffer.n_added - 1, 0)
-    names = [name for name in written if rows_of(name)[1] > oldest]
+    names = [name for name in writer.checksums if rows_of(name)[1] > oldest]
     first = max(rows_of(names[-1])[1] if names else 0, oldest)
     if first < last:
         names.append(segment_name(first, last))
