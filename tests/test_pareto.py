@@ -805,10 +805,20 @@ def test_what_is_no_front_is_an_error_that_names_the_file(tmp_path):
         ParetoFront.load(tmp_path / "none.npz")
 
 
-@pytest.mark.parametrize("change", [{"returns": None}, {"another": 1}])
-def test_a_front_that_lacks_an_array_or_has_an_unknown_one_is_an_error_that_names_the_file(tmp_path, change):
+WRONG_FRONTS = [
+    {"returns": None},
+    {"another": 1},
+    {"returns": np.zeros((3, 2))},
+    {"returns": "none"},
+    {"preferences": np.zeros((4, 2))},
+    {"episode_lengths": np.zeros(3, dtype=np.int64)},
+]
+
+
+@pytest.mark.parametrize("change", WRONG_FRONTS)
+def test_a_front_whose_arrays_are_not_those_of_a_front_is_an_error_that_names_the_file(tmp_path, change):
     front = evaluate_front(FirstWeight(), SeededEnv, 3, 2)
-    tree = {"format": "sb3_momba.front", **vars(front), **change}
+    tree = {"format": "sb3_momba.front", "version": 1, **vars(front), **change}
     write_tree(tmp_path / "front.npz", {name: value for name, value in tree.items() if value is not None})
     with pytest.raises(FileFormatError, match=r"front\.npz"):
         ParetoFront.load(tmp_path / "front.npz")

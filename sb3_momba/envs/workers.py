@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 TIMEOUT = 300.0
 
 
-class WorkerError(RuntimeError):
-    """An environment's process raised an error, died or does not answer; all processes of its VecEnv have been ended."""
+class WorkerError(Exception):
+    """A process raised an error, died or does not answer; the processes beside it have been ended."""
 
 
 @dataclass(frozen=True)

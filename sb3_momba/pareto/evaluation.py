@@ -1,10 +1,7 @@
 """Rolling out a policy under a grid of preferences (section 4.1.2)."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, fields
-from multiprocessing import get_all_start_methods, get_context
-from multiprocessing.context import BaseContext
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -14,16 +11,17 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.files import FileFormatError, FilePath, read_tree, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.pareto import metrics
+from sb3_momba.pareto.processes import in_processes
 from sb3_momba.pareto.protocol import N_EPISODES, N_PREFERENCES
 
 MAX_PARALLEL_EPISODES = BATCH = 128
-FRONT_FORMAT = "sb3_momba.front"
+FRONT_FORMAT, FRONT_VERSION = "sb3_momba.front", 1
 
 Array = NDArray[np.float64]
 
@@ -83,7 +81,7 @@ class ParetoFront:
 
     def save(self, path: FilePath) -> None:
         """Write one file, ".npz" appended if it has no suffix, atomically and without pickle."""
-        write_tree(with_suffix(path, ".npz"), {"format": FRONT_FORMAT, **vars(self)})
+        write_tree(with_suffix(path, ".npz"), {"format": FRONT_FORMAT, "version": FRONT_VERSION, **vars(self)})
 
     @classmethod
     def load(cls, path: FilePath) -> "ParetoFront":
@@ -91,9 +89,22 @@ class ParetoFront:
         tree, _ = read_tree(with_existing_suffix(path, ".npz"))
         if not isinstance(tree, dict) or tree.pop("format", None) != FRONT_FORMAT:
             raise FileFormatError(f"{path} holds no Pareto front.")
+        version = tree.pop("version", None)
+        if version != FRONT_VERSION:
+            raise FileFormatError(f"{path} has format version {version!r}, this sb3_momba reads {FRONT_VERSION}.")
         names = {field.name for field in fields(cls)}
         if set(tree) != names:
             raise FileFormatError(f"{path} holds {sorted(tree)}, not what a Pareto front has: {sorted(names)}.")
+        shapes = {name: getattr(tree[name], "shape", ()) for name in sorted(names - {"settings"})}
+        returns = shapes["returns"]
+        expected = {
+            "preferences": returns[::2],
+            "returns": returns,
+            "discounted_returns": returns,
+            "episode_lengths": returns[:2],
+        }
+        if len(returns) != 3 or shapes != expected:
+            raise FileFormatError(f"{path} holds arrays that do not go together, of shapes {shapes}.")
         return cls(**tree)
 
 
@@ -146,9 +157,7 @@ def evaluate_front(
     else:
         policy = model.policy if isinstance(model, BaseAlgorithm) else model  # without environments and replay buffer
         parts = [jobs[i::n_workers] for i in range(n_workers)]
-        runs = [(policy, env, env_kwargs, part, gamma, deterministic) for part in parts if part]
-        with ProcessPoolExecutor(len(runs), mp_context=_worker_context()) as pool:
-            results = list(pool.map(_run_pickled, map(CloudpickleWrapper, runs)))
+        results = in_processes(_run_jobs, [(policy, env, env_kwargs, part, gamma, deterministic) for part in parts if part])
         n_objectives = grid.shape[1]
         returns, discounted = np.zeros((2, len(jobs), n_objectives))
         lengths = np.zeros(len(jobs), dtype=np.int64)
@@ -169,19 +178,6 @@ Jobs = Sequence[tuple[int, np.ndarray, int]]  # number among all jobs, preferenc
 Measured = tuple[Array, Array, NDArray[np.int64]]
 
 
-def _worker_context() -> BaseContext:
-    """Processes that start from a clean one, which has the package loaded already."""
-    if "forkserver" not in get_all_start_methods():
-        return get_context("spawn")
-    context = get_context("forkserver")
-    context.set_forkserver_preload(["sb3_momba"])
-    return context
-
-
-def _run_pickled(run: CloudpickleWrapper) -> Measured:
-    return _run_jobs(*run.var)
-
-
 def _run_jobs(
     model: Predictor,
     env: str | gym.Env | VecEnv | Callable[[], gym.Env],
@@ -189,8 +185,12 @@ def _run_jobs(
     jobs: Jobs,
     gamma: float,
     deterministic: bool,
+    still_alive: Callable[[], None] = lambda: None,
 ) -> Measured:
-    """Returns (n_jobs, n_objectives), discounted ones, and lengths (n_jobs,)."""
+    """Returns (n_jobs, n_objectives), discounted ones, and lengths (n_jobs,).
+
+    :param still_alive: called at each step
+    """
     venv, is_ours = _make_vec_env(env, min(len(jobs), MAX_PARALLEL_EPISODES), env_kwargs)
     n_threads = th.get_num_threads()
     # Sampling actions must not disturb the random numbers of a training that is going on.
@@ -199,14 +199,16 @@ def _run_jobs(
             th.manual_seed(jobs[0][2])
         try:
             th.set_num_threads(1)  # More of them only slow such small products down, and could round them differently.
-            return _run_episodes(model, venv, jobs, gamma, deterministic)
+            return _run_episodes(model, venv, jobs, gamma, deterministic, still_alive)
         finally:
             th.set_num_threads(n_threads)
             if is_ours:
                 venv.close()
 
 
-def _run_episodes(model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, deterministic: bool) -> Measured:
+def _run_episodes(
+    model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, deterministic: bool, still_alive: Callable[[], None]
+) -> Measured:
     """Each environment takes the next (preference, seed) as soon as its episode ends; idle ones go on unheard."""
     n_objectives = jobs[0][1].size
     returns, discounted = np.zeros((2, len(jobs), n_objectives))
@@ -226,6 +228,7 @@ def _run_episodes(model: Predictor, venv: VecEnv, jobs: Jobs, gamma: float, dete
     for index in range(venv.num_envs):
         start_next(index)
     while any(job is not None for job in job_of):
+        still_alive()
         places = [None if job is None else jobs[job][0] for job in job_of]
         next_observations, scalars, dones, infos = venv.step(_predict(model, observations, places, deterministic))
         observations = np.array(next_observations)
