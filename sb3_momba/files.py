@@ -6,6 +6,7 @@ already imported.
 """
 
 import contextlib
+import glob
 import io
 import json
 import math
@@ -26,6 +27,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 import numpy as np
+import psutil
 import torch as th
 from stable_baselines3.common.buffers import BaseBuffer
 from torch import nn
@@ -77,6 +79,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(f"{path} is read-only: choose another name, or make it writable.")
+    delete_unfinished(path)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with open(aside, "wb") as file:
@@ -90,6 +93,14 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and error.filename == os.fspath(aside):
             raise type(error)(error.errno, error.strerror, os.fspath(path)) from error
         raise
+
+
+def delete_unfinished(path: Path) -> None:
+    """What processes that are gone had begun to write in the place of `path`."""
+    for aside in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        process = aside.name.split(".")[-2]
+        if process.isdecimal() and not psutil.pid_exists(int(process)):
+            aside.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

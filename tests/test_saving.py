@@ -5,6 +5,8 @@ import io
 import os
 import random
 import re
+import subprocess
+import sys
 import zipfile
 from collections import deque
 from functools import partial
@@ -852,3 +854,14 @@ def test_an_interrupted_save_leaves_the_old_model_and_buffer(tmp_path, monkeypat
         save(tmp_path / name)
         assert (tmp_path / name).read_bytes() != before
     assert sorted(os.listdir(tmp_path)) == ["buffer.npz", "model.zip"]
+
+
+def test_what_a_killed_process_had_begun_to_write_is_deleted_by_the_next_write(tmp_path):
+    killed = subprocess.Popen([sys.executable, "-c", ""])
+    killed.wait()
+    unfinished, running = (tmp_path / f".tree.zip.{number}.part" for number in (killed.pid, os.getppid()))
+    for path in (unfinished, running, tmp_path / ".tree.zip.part", tmp_path / f".other.zip.{killed.pid}.part"):
+        path.touch()
+    write_tree(tmp_path / "tree.zip", {})
+    assert not unfinished.exists()
+    assert len(list(tmp_path.iterdir())) == 4
