@@ -236,7 +236,7 @@ def read_format(path: FilePath, expected: str) -> dict[str, Any]:
         raise FileFormatError(f"{path} holds {found!r}, not {expected!r}.")
     if tree.get("version") != FORMAT_VERSION:
         raise FileFormatError(
-            f"{path} has format version {tree.get('version')}, this sb3_momba reads {FORMAT_VERSION}: it was written by "
+            f"{path} has format version {tree.get('version')!r}, this sb3_momba reads {FORMAT_VERSION}: it was written by "
             f"{tree.get('versions')}."
         )
     return {**tree, "left_out": left_out}
