@@ -202,7 +202,8 @@ def test_scores_by_hand(fake) -> None:
     np.testing.assert_array_equal(run.steps, [10, 20])
     np.testing.assert_array_equal(run.curve, [2, 6])
     assert [evaluation.seconds for evaluation in run.record.evaluations] == [1, 2]
-    assert not hasattr(run, "seconds")
+    np.testing.assert_array_equal(run.seconds, [1, 2])
+    assert (run.mean_over_steps, run.mean_over_time) == (4, (2 + 4) / 2)
 
 
 def test_regret_is_what_the_answer_to_another_preference_would_have_been_worth(fake) -> None:
@@ -678,15 +679,15 @@ def test_a_report_of_two_objectives(fake, tmp_path) -> None:
     assert len(list((tmp_path / "report").glob("*.png"))) == 2
     row = rows_of(text, "b")[0]
     assert row[1:4] == ["2/2", "20", "210"]
-    assert row[4:] == ["6", "2.667", "0", "0", "4"]  # Equal runs have no interval.
+    assert row[4:] == ["6", "2.667", "0", "0", "4", "3"]  # Equal runs have no interval.
     assert rows_of(text, "a")[0][1:3] == ["1/3", "20"]
     cells = rows_of(text, "a")[0][4:]
-    assert [float(cell.split()[0]) for cell in cells] == pytest.approx(
-        [1 / 3, (1 + 0.5 + 0.5) / 3, 0, (STILL_DISTANCE + 2 * RANDOM_DISTANCE) / 3, (1 + 0.5 + 0) / 3], rel=1e-3
-    )
-    assert ["[" in cell for cell in cells] == [True, True, False, True, True]  # The regret is of one run.
-    assert rows_of(text, r"(standing still)")[0][4:] == ["1", "1", "", f"{STILL_DISTANCE:.4g}", ""]
-    assert rows_of(text, r"(random actions)")[0][4:] == ["0.25", "0.5", "", f"{RANDOM_DISTANCE:.4g}", ""]
+    scores = [1 / 3, (1 + 0.5 + 0.5) / 3, 0, (STILL_DISTANCE + 2 * RANDOM_DISTANCE) / 3]
+    curve_means = [(1 + 0.5 + 0) / 3, (1 + (1 + 0.5) / 2 + 0) / 3]
+    assert [float(cell.split()[0]) for cell in cells] == pytest.approx([*scores, *curve_means], rel=1e-3)
+    assert ["[" in cell for cell in cells] == [True, True, False, True, True, True]  # The regret is of one run.
+    assert rows_of(text, r"(standing still)")[0][4:] == ["1", "1", "", f"{STILL_DISTANCE:.4g}", "", ""]
+    assert rows_of(text, r"(random actions)")[0][4:] == ["0.25", "0.5", "", f"{RANDOM_DISTANCE:.4g}", "", ""]
     assert rows_of(text, "b")[1][1] == "1 (1 tasks)"  # P(b > a)
     assert rows_of(text, "a")[1][2] == "0 (1 tasks)"
     assert "seed 1: RuntimeError: diverged" in text
@@ -708,7 +709,7 @@ def test_fronts_are_drawn_of_two_or_three_objectives(fake, tmp_path, n_objective
 def test_a_report_of_one_evaluation(fake, tmp_path) -> None:
     text = report_of(tmp_path / "report", [fake(FRONT, {10: FRONT}, floors={})])
     assert rows_of(text, "a")[0][1:3] == ["1/1", "10"]
-    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", ""]  # A curve of one point has no mean.
+    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", "", "6"]  # A curve of one point has no mean over steps.
     assert "improvement" not in text
     assert "## Aggregate" not in text
 
@@ -718,8 +719,8 @@ def test_a_report_of_sets_of_solutions(fake, tmp_path) -> None:
     curve = {10: box(1.0), 20: FRONT}
     made = [fake(FRONT, curve), fake([*FRONT, *box(1.0)], {10: [[1.0, 1.0]], 20: FRONT}, label="b", general_policy=False)]
     text = report_of(tmp_path / "report", made)
-    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", "3.5"]
-    assert rows_of(text, "b")[0][4:] == ["6", "2.667", "", "0", "3.5"]
+    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", "3.5", "2.25"]
+    assert rows_of(text, "b")[0][4:] == ["6", "2.667", "", "0", "3.5", "2.25"]
     assert len(list((tmp_path / "report").glob("*.png"))) == 2
 
 
@@ -734,10 +735,10 @@ def test_a_report_without_floors_leaves_blank_what_is_unknown_of_a_run_that_fail
     text = report_of(tmp_path / "report", made)
     hypervolume, *others = rows_of(text, "a")[0][4:]
     assert hypervolume.startswith("3 [0, 6]")
-    assert others == ["2.667", "0", "0", ""]  # The regret is that of the run that is known.
-    assert rows_of(text, "b")[0][4:] == ["0", "2.667", "", "0", ""]
+    assert others == ["2.667", "0", "0", "", ""]  # The regret is that of the run that is known.
+    assert rows_of(text, "b")[0][4:] == ["0", "2.667", "", "0", "", ""]
     text = report_of(tmp_path / "nothing", [fake(None, error=BAD, floors={}, label="b")])
-    assert rows_of(text, "b")[0][4:] == ["0", "", "", "", ""]
+    assert rows_of(text, "b")[0][4:] == ["0", "", "", "", "", ""]
 
 
 @pytest.mark.parametrize("curve", [{}, {10: box(1.0), 20: box(2.0)}], ids=["never evaluated", "evaluated"])
@@ -745,8 +746,9 @@ def test_a_report_of_runs_that_all_failed(fake, tmp_path, curve: dict[int, Any])
     made = [fake(None, curve, error, label=label, floors={}) for label in "ab" for error in (BAD, "cut off")]
     text = report_of(tmp_path / "report", made)
     assert rows_of(text, "a")[0][1] == rows_of(text, "b")[0][1] == "0/2"
-    area = rows_of(text, "a")[0][-1]
-    assert area.startswith("1.5") if curve else area == ""
+    *_, over_steps, over_time = rows_of(text, "a")[0]
+    assert over_steps.startswith("1.5") if curve else over_steps == ""
+    assert over_time == ""  # There is no time that every finished run had.
     assert text.count("diverged") == 2
     assert text.count(UNENDED) == 2
 
@@ -788,13 +790,13 @@ def test_seeds_that_were_recorded_twice_are_named(fake, tmp_path) -> None:
 
 
 def aggregate_of(text: str) -> dict[str, list[str]]:
-    """The cells of each method in the aggregate over tasks."""
+    """The cells of each method in the aggregate over tasks, without those of the curve."""
     after = text.split("## Aggregate\n")[1].split("\n## ")[0]
     table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in after.splitlines() if line.startswith("|")]
     header, _, *rows = table
-    assert header == ["method", "tasks", "normalised hypervolume", "normalised expected utility"]
+    assert header[:4] == ["method", "tasks", "normalised hypervolume", "normalised expected utility"]
     assert len({row[0] for row in rows}) == len(rows)
-    return {name: cells for name, *cells in rows}
+    return {name: cells[:3] for name, *cells in rows}
 
 
 def value_of(cell: str) -> float:
@@ -819,6 +821,16 @@ def test_the_aggregate_by_hand(fake, tmp_path) -> None:
     assert "In units of the IQM of a on each task" in text
     assert text.index("## F") < text.index("## Aggregate")
     assert "## Aggregate" not in report_of(tmp_path / "other", made)
+
+
+def test_curves_in_the_aggregate_by_hand(fake, tmp_path) -> None:
+    """Evaluated after 1 and 2 s, and 1 and 4 s: over the common 2 s, the first second with its end's value."""
+    made = [fake(box(4.0), {10: box(2.0), 20: box(4.0)}), fake(box(4.0), {10: box(1.0), 40: box(7.0)}, label="b")]
+    text = report_of(tmp_path / "report", made, "a")
+    assert rows_of(text, "a")[0][-2:] == ["3", "2.5"]
+    assert rows_of(text, "b")[0][-2:] == ["4", f"{(1 + (1 + 3) / 2) / 2:g}"]
+    assert rows_of(text, "b")[-2][-2:] == [f"{4 / 3:.4g}", f"{1.5 / 2.5:.4g}"]
+    assert "up to 2 s" in text
 
 
 def test_the_baselines_unit_is_an_interquartile_mean(fake, tmp_path) -> None:

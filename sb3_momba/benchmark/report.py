@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
+from sb3_momba.benchmark.results import Run, Task, compare, curve_on
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
@@ -22,14 +22,18 @@ COLUMNS = {
     "expected utility": "expected_utility",
     "preference regret": "preference_regret",
     "IGD": "inverted_generational_distance",
+    "curve over steps": "mean_over_steps",
+    "curve over time": "mean_over_time",
 }
+NORMALISED = ("hypervolume", "expected utility", "curve over steps", "curve over time")
 EXPLANATION = """\
 IQM of the runs with its 95 % interval from a stratified bootstrap, which is too narrow where there are few seeds: of normal
 scores it covers the truth in 71 % of cases with 3 seeds, 89 % with 5, 95 % with 10. Runs: those that finished, of all. A run
 that failed or did not end counts with the hypervolume 0 and with the worst expected utility and IGD among the floors and the
 finished runs; regret is of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all final solutions in
-this report (section 4.4), so it changes with the records; there is none where the envelope is one point. The curve's mean is
-the area under it divided by its length.
+this report (section 4.4), so it changes with the records; there is none where the envelope is one point. The two columns of
+the curve are mean hypervolumes, areas under it divided by its length: over steps from the first evaluation to the last; over
+time up to the seconds of training (of one processor, without evaluations) that every finished run had.
 """
 
 
@@ -48,7 +52,7 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
     names = file_names([task.name for task in tasks])
     for task, name in zip(tasks, names, strict=True):
         parts.append(f"## {task.name}\n")
-        parts.append(f"Reference point {task.reference_point.tolist()}.\n")
+        parts.append(f"Reference point {task.reference_point.tolist()}; curves over time up to {task.seconds:,.0f} s.\n")
         parts.append(task_table(task))
         parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
         parts += [f"Not recorded: {missing}.\n" for missing in missing_seeds(task)]
@@ -92,15 +96,15 @@ def missing_seeds(task: Task) -> list[str]:
 
 
 def task_table(task: Task) -> str:
-    rows = [["method", "runs", "steps", "parameters", *COLUMNS, "mean hypervolume of the curve"]]
+    rows = [["method", "runs", "steps", "parameters", *COLUMNS]]
     for name, (volume, utility, distance) in task.floors.items():
         igd = f"{distance:,.4g}" if np.isfinite(distance) else ""
-        rows.append([f"({name})", "", "", "", f"{volume:,.5g}", f"{utility:,.5g}", "", igd, ""])
+        rows.append([f"({name})", "", "", "", f"{volume:,.5g}", f"{utility:,.5g}", "", igd, "", ""])
     for name, runs in task.methods.items():
         finished = sum(run.is_finished for run in runs)
         steps = max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
         parameters = sum(runs[0].record.parameters.values())
-        scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()] + [areas_under_curve(runs)]
+        scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()]
         known = [[score for score in column if np.isfinite(score)] for column in scores]
         estimates = [as_text(estimate(interquartile_mean, [column])) if column else "" for column in known]
         rows.append([name, f"{finished}/{len(runs)}", f"{steps:,}", f"{parameters:,}", *estimates])
@@ -132,10 +136,10 @@ def aggregate_table(tasks: Sequence[Task], baseline: str) -> str:
     names = sorted({name for task in tasks for name in task.methods})
     if not with_baseline:
         raise ValueError(f"No task has the method {baseline!r}: there are {', '.join(names)}.")
-    rows = [["method", "tasks", "normalised hypervolume", "normalised expected utility"]]
+    rows = [["method", "tasks", *(f"normalised {column}" for column in NORMALISED)]]
     for name in names:
         shared = [methods for methods in with_baseline if name in methods]
-        cells = [normalised(shared, name, baseline, column) for column in ("hypervolume", "expected_utility")]
+        cells = [normalised(shared, name, baseline, COLUMNS[column]) for column in NORMALISED]
         rows.append([name, str(len(shared)), *cells])
     introduction = f"In units of the IQM of {one_line(baseline)} on each task; the IQM is over all runs of all tasks.\n\n"
     return "## Aggregate\n\n" + introduction + markdown(rows)

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,10 @@ class Run:
     A run that failed or did not end counts with the hypervolume 0 and with the worst expected utility and distance among the
     floors and all finished runs. Its regret is unknown: standing still regrets nothing.
 
-    :param curve: hypervolume at each of `steps`
+    :param seconds: of training, at each of `steps`; of processor time where it was recorded
+    :param curve: hypervolume at each of them
+    :param mean_over_steps: of the curve, see `areas_under_curve`
+    :param mean_over_time: of the curve, see `areas_over_time`
     """
 
     record: Record
@@ -40,7 +43,10 @@ class Run:
     preference_regret: float
     inverted_generational_distance: float
     steps: Array
+    seconds: Array
     curve: Array
+    mean_over_steps: float = np.nan
+    mean_over_time: float = np.nan
 
     @property
     def is_finished(self) -> bool:
@@ -52,6 +58,7 @@ class Task:
     """All that was run on one task.
 
     :param methods: runs by the method's name
+    :param seconds: of training that every method had
     :param floors: hypervolume, expected utility and distance of policies that learned nothing, by name
     :param reference_front: the convex envelope of the final solutions of all methods (section 4.4), (n, n_objectives)
     """
@@ -61,6 +68,7 @@ class Task:
     reference_front: Array
     floors: dict[str, tuple[float, float, float]]
     methods: dict[str, list[Run]]
+    seconds: float
 
 
 def compare(records: Iterable[Record], reference_point: ArrayLike | None = None) -> list[Task]:
@@ -96,7 +104,15 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
         method: [_score(record, reference, front, earned) for record in its_records]
         for method, its_records in name_methods(records).items()
     }
-    return Task(name, reference, front, floors, methods)
+    seconds = common_seconds(methods)
+    methods = {
+        method: [
+            replace(run, mean_over_steps=over_steps, mean_over_time=over_time)
+            for run, over_steps, over_time in zip(runs, areas_under_curve(runs), areas_over_time(runs, seconds), strict=True)
+        ]
+        for method, runs in methods.items()
+    }
+    return Task(name, reference, front, floors, methods, seconds)
 
 
 def _reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
@@ -128,12 +144,13 @@ def _check_protocol(name: str, records: Sequence[Record]) -> None:
 def _score(record: Record, reference_point: Array, front: Array, earned: Sequence[tuple[float, float, float]]) -> Run:
     """:param earned: hypervolume, expected utility and distance of floors and finished runs"""
     steps = np.array([evaluation.steps for evaluation in record.evaluations], dtype=np.float64)
+    seconds = np.array([e.seconds if e.cpu_seconds is None else e.cpu_seconds for e in record.evaluations])
     curve = np.array([hypervolume(evaluation.values, reference_point) for evaluation in record.evaluations])
     values = record.final_values
     if values is None:
         utility = min((utility for _, utility, _ in earned), default=np.nan)
         distance = max((distance for _, _, distance in earned), default=np.nan)
-        return Run(record, 0.0, utility, np.nan, distance, steps, curve)
+        return Run(record, 0.0, utility, np.nan, distance, steps, seconds, curve)
     return Run(
         record,
         hypervolume(values, reference_point),
@@ -141,6 +158,7 @@ def _score(record: Record, reference_point: Array, front: Array, earned: Sequenc
         preference_regret(values, record.preferences) if record.general_policy else np.nan,
         normalized_distance(values, front),
         steps,
+        seconds,
         curve,
     )
 
@@ -207,3 +225,28 @@ def areas_under_curve(runs: Sequence[Run]) -> list[float]:
     if len(steps) < 2:
         return [np.nan] * len(runs)
     return [float(area) for area in trapezoid(curves, steps, axis=1) / (steps[-1] - steps[0])]
+
+
+def common_seconds(methods: dict[str, list[Run]]) -> float:
+    """How long the shortest of the finished runs trained; 0 where there is none."""
+    return min(
+        (float(run.seconds[-1]) for runs in methods.values() for run in runs if run.is_finished and len(run.seconds)),
+        default=0.0,
+    )
+
+
+def areas_over_time(runs: Sequence[Run], seconds: float) -> list[float]:
+    """For each run its mean hypervolume over its first `seconds` of training; unknown where that is none.
+
+    Before its first evaluation it counts with that; a run that failed has 0 after its last one.
+    """
+    if seconds == 0:
+        return [np.nan] * len(runs)
+    areas = []
+    for run in runs:
+        times = np.concatenate([[0.0], run.seconds[run.seconds < seconds], [seconds]])
+        curve = (
+            np.interp(times, run.seconds, run.curve, right=None if run.is_finished else 0.0) if len(run.seconds) else 0 * times
+        )
+        areas.append(float(trapezoid(curve, times) / seconds))
+    return areas
