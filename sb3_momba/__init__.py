@@ -5,6 +5,7 @@ __version__ = "0.1.0"
 import sb3_momba.envs.pgmorl  # noqa: F401  registers the tasks of the thesis
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
+from sb3_momba.envs.checking import check_mo_env
 from sb3_momba.envs.wrappers import PreferenceWrapper, make_mo_vec_env
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto.callbacks import ParetoEvalCallback
@@ -22,6 +23,7 @@ __all__ = [
     "PreferenceReplayBuffer",
     "PreferenceWrapper",
     "SimbaPolicy",
+    "check_mo_env",
     "evaluate_front",
     "expected_utility",
     "hypervolume",
