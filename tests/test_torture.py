@@ -1,4 +1,4 @@
-"""The short form of tests/torture.py: kills, full disks, damaged and malicious files, resumption."""
+"""The short form of tests/torture: kills, full disks, damaged and malicious files, resumption."""
 
 import os
 import subprocess
