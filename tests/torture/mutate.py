@@ -58,7 +58,7 @@ def outcome_of(kind: Kind, content: bytes, sealed: bool, canary: Path) -> str:
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
     if canary.exists():
-        canary.unlink()
+        canary.rmdir()
         return "executed"
     return outcome
 
