@@ -16,6 +16,7 @@ from sb3_momba.checkpoints.training_state import set_states_of_callbacks
 from sb3_momba.diagnostics import forgive_full_disks
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.finite import all_finite
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
 
@@ -86,10 +87,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
 
     def _with_preference(self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None) -> np.ndarray:
-        if isinstance(observation, tuple | dict):
+        if isinstance(observation, (tuple, dict)):
             return observation  # the policy's own error
         observation = np.asarray(observation)
-        if not np.isfinite(observation).all():
+        if not all_finite(observation):
             raise ValueError(f"The observation {observation} has a number that is not finite: no action answers it.")
         raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
         width = observation.shape[-1] if observation.ndim > 0 else 0

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_momba.envs.preferences import preference_dim
 from sb3_momba.envs.wrappers import LARGEST_REWARD
+from sb3_momba.finite import all_finite
 
 SMALLEST_CONCENTRATION = 1e-3
 SCALARISATION_TOLERANCE = 1e-4
@@ -128,7 +129,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         """
         vector_rewards = self._vector_rewards(reward, infos)
         for observations in (obs, next_obs):
-            if not np.isfinite(observations).all():
+            if not all_finite(observations):
                 index = int((~np.isfinite(observations)).any(axis=1).argmax())
                 raise ValueError(f"Environment {index}: the observation {observations[index]} has a number that is not finite.")
         raw = self.observation_dim
@@ -143,7 +144,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self, appended: np.ndarray, reward: np.ndarray, vector_rewards: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
         """Observations must end in the w, and rewards be the w.r, that PreferenceWrapper reports."""
-        w = np.stack([info["preference"] for info in infos])
+        w = np.array([info["preference"] for info in infos])
         products = w * vector_rewards
         tolerance = SCALARISATION_TOLERANCE * (1 + np.abs(products).sum(axis=1))
         if self.preference_dim > 0 and not np.array_equal(appended, w):
@@ -182,7 +183,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
             for index, vector in enumerate(vectors):
                 if np.shape(vector) != expected[1:]:
                     raise ValueError(f"Environment {index}: vector_reward has shape {np.shape(vector)}, not {expected[1:]}.")
-            rewards = np.stack(vectors)
+            rewards = np.array(vectors)
         elif self.n_objectives == 1:
             rewards = np.asarray(reward, dtype=np.float32)
             if rewards.shape != (self.n_envs,):
@@ -197,9 +198,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
                 f"Environment {index}: info has no 'vector_reward'. A wrapper outside PreferenceWrapper drops it: put that "
                 "wrapper inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
             )
-        wrong = ~(np.abs(rewards) <= LARGEST_REWARD)
-        if wrong.any():
-            index, objective = np.argwhere(wrong)[0]
+        if not np.abs(rewards).max() <= LARGEST_REWARD:
+            index, objective = np.argwhere(~(np.abs(rewards) <= LARGEST_REWARD))[0]
             raise ValueError(
                 f"Environment {index}: the reward of objective {objective} is {rewards[index, objective]}: rewards must be "
                 f"finite and at most {LARGEST_REWARD:g} in size. It was not stored."

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_momba.finite import all_finite
+
 PreferenceSampler = Callable[[np.random.Generator], np.ndarray]
 SamplerSpec = str | dict[str, Any] | Sequence[float]
 
@@ -40,7 +42,7 @@ def check_preference(preference: Sequence[float] | np.ndarray, n_objectives: int
         raise ValueError(f"The preference {preference!r} is not an array of {n_objectives} numbers.") from error
     if w.ndim not in (1, 2) or w.shape[-1] != n_objectives:
         raise ValueError(f"The preference {preference!r} has shape {w.shape}: give {n_objectives} weights, one per objective.")
-    if not np.isfinite(w).all():
+    if not all_finite(w):
         raise ValueError(f"The preference {preference!r} has a weight that is not finite.")
     if (w < -SIMPLEX_TOLERANCE).any():
         raise ValueError(f"The preference {preference!r} has a negative weight: weights are at least 0 and sum to 1.")

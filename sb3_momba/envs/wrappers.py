@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, Su
 
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.workers import WatchedSubprocVecEnv
+from sb3_momba.finite import all_finite
 
 LARGEST_REWARD = 1e10
 LONGEST_REPLAY = 20_000  # actions of an episode that are noted
@@ -197,7 +198,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             )
         w = self._preference if self.preference_dim > 0 else self._preference[:0]
         wrapped = np.concatenate([observation, w], dtype=np.float32)
-        if not np.isfinite(wrapped).all():
+        if not all_finite(wrapped):
             raise ValueError(
                 f"{self._where()}: the observation has a number that is not finite: {observation}. Mend the environment, "
                 "or end the episode before its state diverges."
@@ -219,10 +220,10 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
                 f"{self._where()}: the reward {reward!r} has shape {vector.shape} where {expected} is declared: {cure}."
             )
         vector = vector.reshape(self.n_objectives).astype(np.float64)
-        wrong = ~(np.abs(vector) <= LARGEST_REWARD)
-        if wrong.any():
+        if not all(abs(number) <= LARGEST_REWARD for number in vector.tolist()):
+            objective = int((~(np.abs(vector) <= LARGEST_REWARD)).argmax())
             raise ValueError(
-                f"{self._where()}: the reward of objective {int(wrong.argmax())} is {vector[wrong.argmax()]}: rewards must be "
+                f"{self._where()}: the reward of objective {objective} is {vector[objective]}: rewards must be "
                 f"finite and at most {LARGEST_REWARD:g} in size. It was not stored."
             )
         return vector.astype(np.float32)

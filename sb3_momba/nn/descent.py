@@ -1,5 +1,7 @@
 """One step of an optimiser, and of a target network."""
 
+import math
+
 import torch as th
 
 
@@ -15,13 +17,25 @@ class NonFiniteLossError(ArithmeticError):
 
 def descend(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
     """One step of an optimiser on its own parameters; gradients of all others are not even computed."""
-    if not th.isfinite(loss):
-        raise NonFiniteLossError(f"its loss is {loss.item()}.")
+    check_loss(loss)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     optimizer.zero_grad(set_to_none=True)
     loss.backward(inputs=parameters)  # type: ignore[no-untyped-call]
-    norm = th.stack(th._foreach_norm([p.grad for p in parameters if p.grad is not None])).norm()
-    if not th.isfinite(norm):
+    try:
+        check_gradients(parameters, loss)
+    except NonFiniteLossError:
         optimizer.zero_grad(set_to_none=True)
-        raise NonFiniteLossError(f"its loss is {loss.item():g}, the norm of its gradient {norm.item()}.")
+        raise
     optimizer.step()
+
+
+def check_loss(loss: th.Tensor) -> None:
+    if not math.isfinite(loss.item()):
+        raise NonFiniteLossError(f"its loss is {loss.item()}.")
+
+
+def check_gradients(parameters: list[th.Tensor], loss: th.Tensor) -> None:
+    norms = th.stack(th._foreach_norm([p.grad for p in parameters if p.grad is not None]))
+    norm = math.hypot(*norms.tolist())
+    if not math.isfinite(norm):
+        raise NonFiniteLossError(f"its loss is {loss.item():g}, the norm of its gradient {norm:g}.")
