@@ -1,4 +1,4 @@
-"""The short form of tests/torture: kills, full disks, damaged and malicious files, resumption."""
+"""The short form of tests/torture: kills, full disks, damaged and malicious files, resumption, the cost of checks."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Processes are forked, killed and limited.")
 
 
-@pytest.mark.parametrize("part", ["kill", "operations", "resume", "mutate", "disk"])
+@pytest.mark.parametrize("part", ["kill", "operations", "resume", "mutate", "disk", "guards"])
 def test_every_promise_holds(part):
     # In a process of its own: one that has computed on several threads could not be forked.
     command = [sys.executable, "-m", "tests.torture", part, "--counts", "short"]

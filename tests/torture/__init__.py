@@ -9,4 +9,5 @@ exit status is 1 if there is one. For Linux: processes are forked, killed and li
 - mutate: damaged and malicious files
 - disk: a disk that is full at any byte
 - million: what a checkpoint costs with a million transitions in the replay buffer (`--counts long` only)
+- guards: what all checks of a training's numbers cost of its step rate
 """

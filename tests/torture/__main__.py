@@ -11,6 +11,7 @@ import torch as th
 
 from sb3_momba.benchmark.tables import markdown
 from tests.torture.disk import disk
+from tests.torture.guards import guards
 from tests.torture.kill import kill
 from tests.torture.measured import Counts
 from tests.torture.million import million
@@ -32,6 +33,8 @@ COUNTS = {
         "every_slot": 1,
         "limits": 40,
         "checkpoints": 5,
+        "windows": 20,
+        "window_steps": 40,
     },
     "short": {
         "kills": 8,
@@ -43,9 +46,19 @@ COUNTS = {
         "mutations": 300,
         "every_slot": 10,
         "limits": 6,
+        "windows": 3,
+        "window_steps": 4,
     },
 }
-PARTS = {"kill": kill, "operations": operations, "resume": resume, "mutate": mutate, "disk": disk, "million": million}
+PARTS = {
+    "kill": kill,
+    "operations": operations,
+    "resume": resume,
+    "mutate": mutate,
+    "disk": disk,
+    "million": million,
+    "guards": guards,
+}
 MOST_SHOWN = 20
 
 
