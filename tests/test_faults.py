@@ -35,6 +35,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_momba import MOMBA, PreferenceWrapper, files, make_mo_vec_env
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, check_preference
 from sb3_momba.files import FileFormatError, read_tree
+from sb3_momba.finite import all_finite
 from sb3_momba.nn.descent import NonFiniteLossError
 from sb3_momba.saving import PickleFreeSaving
 from tests.stubs import StubEnv, assert_same_tree, observation_of, reward_of, tiny_model
@@ -160,6 +161,14 @@ def test_row_08_predict_never_answers_a_nan_observation_with_a_nan_action():
     model = tiny_model(StubEnv())
     with pytest.raises(ValueError, match=r"observation.*finite"):
         model.predict(np.array([0.0, np.nan, 0.0]), preference=[0.5, 0.5])
+
+
+@pytest.mark.parametrize("number", [0.0, 1e30, -3e38, np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("shape", [(3,), (2, 3)])
+def test_row_08_a_number_is_finite_even_where_its_square_is_not(number, shape):
+    x = np.ones(shape, dtype=np.float32)
+    x[..., 1] = number
+    assert all_finite(x) == np.isfinite(number)
 
 
 # ------------------------------------------------------------------------- 9 to 12: arrays, wrappers, vectorisation
