@@ -37,8 +37,10 @@ setup(
     ],
     extras_require={
         "baselines": ["morl-baselines>=1.3"],
+        "export": ["onnx>=1.16"],  # .onnx files; TorchScript needs nothing
         "test": [
-            "sb3-momba[baselines]",
+            "sb3-momba[baselines,export]",
+            "onnxruntime>=1.18",
             "pymoo>=0.6",
             "rliable>=1.2",
             "pandas<3",  # rliable's bootstrap library fails with newer ones

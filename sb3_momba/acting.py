@@ -1,6 +1,7 @@
 """What makes an off-policy algorithm act on preferences: environments, prediction, exploration, episodes."""
 
 import logging
+import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from sb3_momba.checkpoints.training_state import set_states_of_callbacks
 from sb3_momba.diagnostics import forgive_full_disks
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.export import export_policy
 from sb3_momba.finite import all_finite
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
@@ -85,6 +87,21 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         :raises ValueError: if one of both is missing, doubled or of the wrong shape
         """
         return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
+
+    def export(self, path: str | os.PathLike[str], preference: Sequence[float] | np.ndarray | None = None) -> None:
+        """Write the deterministic policy as a graph that runs without this package; the old file stands until the new one is
+        whole.
+
+        Its inputs are "observation", float32 (batch, observation_dim) as the environment gives it, and "preference", float32
+        (batch, n_objectives), weights of at least 0 that sum to 1, neither of which it checks; its output is "action", float32
+        (batch, action_dim), within the action space's bounds: what `predict(..., deterministic=True)` gives, but for rounding.
+
+        :param path: ".onnx" (needs the package onnx), or ".pt" or ".ts" for TorchScript
+        :param preference: (n_objectives,), built in; the graph then has one input, as with one objective
+        :raises ValueError: for another suffix, or a wrong preference
+        :raises ImportError: if onnx is missing
+        """
+        export_policy(self.policy, path, preference)
 
     def _with_preference(self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None) -> np.ndarray:
         if isinstance(observation, (tuple, dict)):

@@ -42,10 +42,14 @@ class RunningStatistics(nn.Module):
         """(dim,), 1 before the second observation."""
         return th.where(self.count > 1, self.m2 / self.count.clamp_min(1), 1.0)
 
+    @property
+    def inverse_deviation(self) -> th.Tensor:
+        """1 / sqrt(variance + eps), (dim,), float32."""
+        return (self.variance + VARIANCE_EPS).rsqrt().float()
+
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """(x - mean) / sqrt(variance + eps), (batch, dim) -> (batch, dim), float32."""
-        inverse_deviation = (self.variance + VARIANCE_EPS).rsqrt().float()
-        return (observations - self.mean.float()) * inverse_deviation
+        return (observations - self.mean.float()) * self.inverse_deviation
 
 
 class ReturnScale(nn.Module):
