@@ -5,9 +5,11 @@ in it.
 """
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ import gymnasium as gym
 import yaml
 
 from sb3_momba.pareto import protocol
+from sb3_momba.records import plain
 from sb3_momba.runs import RunResult, RunSettings, resume, run
-from sb3_momba.zoo.configuration import Configuration, literal, read_configuration, shipped_configurations
+from sb3_momba.zoo.configuration import Configuration, literal, read_configuration, shipped_configurations, with_defaults
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
 
@@ -153,6 +156,38 @@ def assign(values: dict[str, Any], assignment: str, option: str = "--set") -> No
         values[key] = literal(yaml.safe_load(text))
     except yaml.YAMLError as error:
         raise ValueError(f"{option} {assignment}: {text!r} is no yaml literal.") from error
+
+
+def command_of(config: dict[str, Any]) -> list[str]:
+    """The command line that a run's settings, as its record has them, come from: what differs from the defaults."""
+    usual = {field.name: field.default for field in fields(RunSettings)}
+    words = ["python", "-m", "sb3_momba.train"]
+    for name in ("env", "steps", "seed", "label", "n_envs", "eval_freq", "n_preferences", "n_episodes", "device"):
+        if name in ("env", "steps", "seed") or config[name] != usual[name]:
+            words += [option(name), str(config[name])]
+    for name in ("reference_point", "objectives"):
+        if config[name] is not None:
+            words += [option(name), *map(str, config[name])]
+    if config["subprocesses"]:
+        words.append("--subprocesses")
+    if config["policy"] != usual["policy"]:
+        words += ["--architecture", {policy: name for name, policy in ARCHITECTURES.items()}[config["policy"]]]
+    defaults = flat(plain(with_defaults(config["policy"], {})))
+    changed = {name: x for name, x in flat(config["hyperparameters"]).items() if name not in defaults or x != defaults[name]}
+    for option_name, values in (("--set", changed), ("--env-kwargs", config["env_kwargs"])):
+        for name, value in values.items():
+            words += [option_name, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    return words
+
+
+def option(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def flat(hyperparameters: dict[str, Any]) -> dict[str, Any]:
+    """With `policy_kwargs.name` in place of a dictionary inside."""
+    of_policy = {f"policy_kwargs.{name}": value for name, value in hyperparameters["policy_kwargs"].items()}
+    return {**{name: value for name, value in hyperparameters.items() if name != "policy_kwargs"}, **of_policy}
 
 
 def parse_resume(arguments: Sequence[str]) -> argparse.Namespace | None:
