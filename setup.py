@@ -38,8 +38,9 @@ setup(
     extras_require={
         "baselines": ["morl-baselines>=1.3"],
         "export": ["onnx>=1.16"],  # .onnx files; TorchScript needs nothing
+        "hub": ["huggingface_hub>=0.30"],
         "test": [
-            "sb3-momba[baselines,export]",
+            "sb3-momba[baselines,export,hub]",
             "onnxruntime>=1.18",
             "pymoo>=0.6",
             "rliable>=1.2",
