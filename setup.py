@@ -21,7 +21,7 @@ setup(
     python_requires=">=3.10",
     install_requires=[
         "stable-baselines3>=2.9,<3",
-        "torch>=2.4",
+        "torch>=2.8",
         "gymnasium[mujoco]>=1.1",
         "mujoco>=3.2",
         "mo-gymnasium>=1.3",

@@ -1,9 +1,9 @@
 """A trained policy as one graph that runs without this package: ONNX (".onnx"), or TorchScript (".pt", ".ts").
 
-ONNX is written by torch's older exporter (`dynamo=False`). All of torch from 2.4 on have it, it needs nothing but the package
-onnx, and takes tenths of a second; the newer one came with 2.5, needs a release of onnxscript that fits torch's, and takes
-seconds. The second format is a trace, which C++ runs as Python does; what torch.export writes needs Python or a compiler. No
-branch of an actor depends on its input, so a trace misses nothing.
+ONNX is written by torch's older exporter (`dynamo=False`). It needs nothing but the package onnx, and takes tenths of a second;
+the newer one needs a release of onnxscript that fits torch's, and takes seconds. The second format is a trace, which C++ runs
+as Python does; what torch.export writes needs Python or a compiler. No branch of an actor depends on its input, so a trace
+misses nothing.
 
 Torch calls both deprecated without naming an end. Before a file is written, its graph is compared with the policy.
 """

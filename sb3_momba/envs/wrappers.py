@@ -1,6 +1,8 @@
 """The wrapper that conditions observations on a preference, and vectorised environments that carry it."""
 
+import contextlib
 import logging
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -291,10 +293,9 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
     """
     if isinstance(env, str):
         if render_mode is not None:
-            try:
+            with contextlib.suppress(TypeError), warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "(?s).*render_mode", UserWarning)  # It need not have this one.
                 return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
-            except TypeError:
-                pass
         try:
             return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
         except TypeError as error:
