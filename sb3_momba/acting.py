@@ -3,12 +3,13 @@
 import logging
 import os
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
@@ -151,7 +152,14 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        """SB3's; where it resets the environments, the episodes that were going on end here."""
+        """SB3's; where it resets the environments, the episodes that were going on end here.
+
+        SB3 resets the action noise at every `learn`: after a checkpoint it goes on from where it was instead.
+        """
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:  # those of another VecEnv
+            self.action_noise = noise.base_noise
+        noise_so_far = deepcopy(self.action_noise) if self._states_of_callbacks is not None else None
         if reset_num_timesteps or self._last_obs is None:
             self.policy.return_scale.end_episodes()
             self.replay_buffer.end_episodes()
@@ -160,6 +168,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         self._root_callback = root
         forgive_full_disks(self.logger)
         if self._states_of_callbacks is not None:
+            self.action_noise = noise_so_far
             set_states_of_callbacks(root, self._states_of_callbacks)
             self._states_of_callbacks = None
         return total_timesteps, root

@@ -6,36 +6,28 @@ import os
 import warnings
 import zipfile
 from collections.abc import Iterable
-from dataclasses import fields
 from typing import Any, TypeVar
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.type_aliases import GymEnv, TensorDict, TrainFreq, TrainFrequencyUnit
-from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
-from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.files import (
     WRONG_CONTENT,
     FileFormatError,
     FilePath,
     content_of,
-    read_tree,
-    register,
     with_existing_suffix,
     with_suffix,
     write_tree,
 )
+from sb3_momba.formats import header, read_format
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.settings import nearest
-from sb3_momba.system import library_versions
 
-FORMAT_VERSION = 1
 MODEL_FORMAT = "sb3_momba.model"
 BUFFER_FORMAT = "sb3_momba.replay_buffer"
 
@@ -70,9 +62,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         excluded = set(exclude or ()) | (set(self._excluded_save_params()) - set(include or ()))
         excluded |= {name.split(".")[0] for name in [*module_names, *tensor_names]}
         return {
-            "format": MODEL_FORMAT,
-            "version": FORMAT_VERSION,
-            "versions": library_versions(),
+            **header(MODEL_FORMAT),
             "data": {name: value for name, value in self.__dict__.items() if name not in excluded},
             "params": self.get_parameters(),
             "tensors": {name: recursive_getattr(self, name) for name in tensor_names},
@@ -172,9 +162,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         """Write what the replay buffer holds into one file, ".npz" appended if it has no suffix."""
         buffer = self.replay_buffer
         tree = {
-            "format": BUFFER_FORMAT,
-            "version": FORMAT_VERSION,
-            "versions": library_versions(),
+            **header(BUFFER_FORMAT),
             **{name: getattr(buffer, name) for name in ("n_envs", "n_objectives", "buffer_size", "pos", "full")},
             "rng": buffer.rng.bit_generator.state,
             "arrays": {name: getattr(buffer, name)[: buffer.size()] for name in STORED_ARRAYS},
@@ -228,20 +216,6 @@ class PickleFreeSaving(OffPolicyAlgorithm):
 CLASSES_AT = {"policy_class": MombaPolicy, "replay_buffer_class": PreferenceReplayBuffer}
 
 
-def read_format(path: FilePath, expected: str) -> dict[str, Any]:
-    """The tree of a file of one of our formats, with `left_out` beside its own entries."""
-    tree, left_out = read_tree(path)
-    found = tree.get("format") if isinstance(tree, dict) else None
-    if found != expected:
-        raise FileFormatError(f"{path} holds {found!r}, not {expected!r}.")
-    if tree.get("version") != FORMAT_VERSION:
-        raise FileFormatError(
-            f"{path} has format version {tree.get('version')!r}, this sb3_momba reads {FORMAT_VERSION}: it was written by "
-            f"{tree.get('versions')}."
-        )
-    return {**tree, "left_out": left_out}
-
-
 def read_model(path: FilePath) -> dict[str, Any]:
     """The tree of a model's file, complete."""
     path = with_existing_suffix(path, ".zip")
@@ -278,36 +252,3 @@ def _check_env_fits(env: Any, data: dict[str, Any]) -> None:
     for name, value in theirs.items():
         if value != data[name]:
             raise ValueError(f"The model was trained with {name}={data[name]}, this environment has {name}={value}.")
-
-
-def _register_box() -> None:
-    def to_tree(box: spaces.Box) -> dict[str, Any]:
-        return {"low": box.low, "high": box.high, "random": box.np_random.bit_generator.state}
-
-    def from_tree(tree: dict[str, Any]) -> spaces.Box:
-        box = spaces.Box(tree["low"], tree["high"], dtype=tree["low"].dtype)
-        box.np_random.bit_generator.state = tree["random"]
-        return box
-
-    register(spaces.Box, to_tree, from_tree)
-
-
-def _register_simple(cls: type, names: tuple[str, ...]) -> None:
-    """A class that is made anew from some of its attributes."""
-    register(
-        cls,
-        lambda x: {name: getattr(x, name) for name in names},
-        lambda tree: cls(**{name: tree[name] for name in names}),
-    )
-
-
-_register_box()
-for _sampler in (UniformSampler, ConeSampler, FixedSampler, PerStepSampler):
-    _register_simple(_sampler, tuple(field.name for field in fields(_sampler)))
-register(TrainFreq, lambda x: [x.frequency, x.unit.value], lambda tree: TrainFreq(tree[0], TrainFrequencyUnit(tree[1])))
-_register_simple(ConstantSchedule, ("val",))
-_register_simple(LinearSchedule, ("start", "end", "end_fraction"))
-register(FloatSchedule, lambda x: x.value_schedule, FloatSchedule)
-register(
-    NormalActionNoise, lambda x: {"mean": x._mu, "sigma": x._sigma}, lambda tree: NormalActionNoise(tree["mean"], tree["sigma"])
-)

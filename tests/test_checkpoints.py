@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, make_mo_vec_env
@@ -65,6 +66,10 @@ VARIANTS = {
     },
     "3-step returns, four environments": {"n_steps": 3, "n_envs": 4, "gradient_steps": -1},
     "episodes": {"train_freq": (1, "episode"), "gradient_steps": 2},
+    "noise that remembers": {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5))},
+    "noise that remembers, three environments": {
+        **{"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5)), "n_envs": 3},
+    },
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": "linear"},
 }
 

@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
@@ -638,8 +638,35 @@ def test_samplers_and_noise_of_the_library_come_back(tmp_path):
     np.testing.assert_array_equal(again.action_noise._sigma, noise._sigma)
 
 
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_noise_that_remembers_comes_back_where_it_was(n_envs):
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2), 0.3, 0.1, initial_noise=np.ones(2), dtype=np.float64)
+    model = tiny_model(make_mo_vec_env(StubEnv, n_envs), action_noise=noise).learn(26 * n_envs)
+    again = MOMBA.load(saved(model))
+    assert_same_tree(draws(again.action_noise), draws(model.action_noise))
+    for one in (model, again):
+        one.action_noise.reset()
+    assert_same_tree(draws(again.action_noise), draws(model.action_noise))
+
+
+def draws(noise: ActionNoise) -> list[np.ndarray]:
+    np.random.seed(0)  # noqa: NPY002
+    return [noise() for _ in range(3)]
+
+
+@pytest.mark.parametrize(("before", "after"), [(3, 2), (3, 1), (1, 3)])
+def test_noise_fits_the_environments_that_a_model_is_loaded_with(before, after):
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.1))
+    model = tiny_model(make_mo_vec_env(StubEnv, before), action_noise=noise).learn(30)
+    again = MOMBA.load(saved(model), make_mo_vec_env(StubEnv, after)).learn(30)
+    assert again.action_noise().shape == ((2,) if after == 1 else (after, 2))
+
+
 def test_noise_that_cannot_be_stored_is_left_out_with_a_warning():
-    model = tiny_model(StubEnv(), action_noise=OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2)))
+    class OwnNoise(NormalActionNoise):
+        pass
+
+    model = tiny_model(StubEnv(), action_noise=OwnNoise(np.zeros(2), np.ones(2)))
     with pytest.warns(UserWarning, match=r"data\.action_noise is a callable"):
         file = saved(model)
     with pytest.warns(UserWarning, match="action_noise was not stored"):
