@@ -1,18 +1,24 @@
 """SimbaPolicy and MlpPolicy: actor, critic ensemble, target critics and running statistics in one module."""
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import get_device
 
 from sb3_momba.envs.preferences import preference_dim
+from sb3_momba.files import FileFormatError, FilePath, content_of, write_tree
+from sb3_momba.formats import header, read_format
 from sb3_momba.nn.layers import project_weights
 from sb3_momba.nn.networks import Actor, Architecture, Critic, MlpArchitecture, SimbaArchitecture
 from sb3_momba.nn.normalization import ReturnScale, RunningStatistics
 from sb3_momba.nn.values import DistributionalValue, ExpectedValue
+
+POLICY_FORMAT = "sb3_momba.policy"
+Self = TypeVar("Self", bound="MombaPolicy")
 
 
 class MombaPolicy(BasePolicy):
@@ -30,6 +36,7 @@ class MombaPolicy(BasePolicy):
     """
 
     action_space: spaces.Box
+    arguments: dict[str, Any]  # of the constructor, from which `load` makes a policy again; a subclass adds its own
 
     def __init__(
         self,
@@ -114,14 +121,35 @@ class MombaPolicy(BasePolicy):
             for module in self.modules():
                 vars(module)["training"] = mode
 
-    def save(self, path: str) -> None:
-        """Policies are saved with their model, without pickle."""
-        raise NotImplementedError("Save the model instead: model.save(path); MOMBA.load(path).policy brings the policy back.")
+    def save(self, path: FilePath) -> None:  # type: ignore[override]
+        """Write the networks and their statistics into one file, exactly at `path`; the optimisers are the model's.
+
+        :raises TypeError: names an argument that cannot be stored without pickle
+        """
+        spaces = {"observation_space": self.observation_space, "action_space": self.action_space}
+        write_tree(
+            path,
+            {
+                **header(POLICY_FORMAT),
+                "policy": type(self).__name__,
+                "arguments": {**spaces, **self.arguments},
+                "state_dict": dict(self.state_dict()),
+            },
+        )
 
     @classmethod
-    def load(cls, path: str, device: th.device | str = "auto") -> "MombaPolicy":
-        """Policies are loaded with their model, without pickle."""
-        raise NotImplementedError("Load the model instead: MOMBA.load(path).policy.")
+    def load(cls: type[Self], path: FilePath, device: th.device | str = "auto") -> Self:  # type: ignore[override]
+        """A policy from the file that `save` wrote: `predict` takes [observation, preference].
+
+        :raises FileFormatError: if the file is damaged or no policy of this class
+        """
+        tree = read_format(path, POLICY_FORMAT)
+        if tree.get("policy") != cls.__name__:
+            raise FileFormatError(f"{path} holds a {tree.get('policy')}, not a {cls.__name__}: load it with that class.")
+        with content_of(path):
+            policy = cls(lr_schedule=cls._dummy_schedule, **tree["arguments"])
+            policy.load_state_dict(tree["state_dict"])
+        return policy.to(get_device(device))
 
     def forward(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
@@ -166,6 +194,16 @@ class SimbaPolicy(MombaPolicy):
             normalize_weights=normalize_weights,
             **kwargs,
         )
+        self.arguments = {
+            "actor_hidden_dim": actor_hidden_dim,
+            "actor_blocks": actor_blocks,
+            "critic_hidden_dim": critic_hidden_dim,
+            "critic_blocks": critic_blocks,
+            "conditioning": conditioning,
+            "normalize_features": normalize_features,
+            "normalize_weights": normalize_weights,
+            **kwargs,
+        }
 
 
 class MlpPolicy(MombaPolicy):
@@ -199,3 +237,9 @@ class MlpPolicy(MombaPolicy):
             normalize_weights=False,
             **kwargs,
         )
+        self.arguments = {
+            "net_arch": net_arch,
+            "conditioning": conditioning,
+            "ortho_init": ortho_init,
+            **kwargs,
+        }

@@ -9,7 +9,7 @@ ensemble. The preference is part of its input; `conditioning` (section 4.3.4) sa
 - "film+all": both
 """
 
-from typing import Protocol
+from typing import Any, NoReturn, Protocol
 
 import torch as th
 import torch.nn.functional as F
@@ -198,6 +198,12 @@ class Actor(nn.Module):
         """Actions on [-1, 1], (batch, action_dim)."""
         mean, log_std = self.distribution(observations)
         return th.tanh(mean if deterministic else mean + log_std.exp() * th.randn_like(mean))
+
+    def predict(self, *_: Any, **__: Any) -> NoReturn:
+        """SAC's actor predicts and is saved alone; this one does not know the observation statistics, the policy does."""
+        raise NotImplementedError("The actor reads normalised observations: use policy.predict, policy.save and policy.load.")
+
+    save = load = predict
 
     def action_log_prob(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Sampled actions (batch, action_dim) and log pi(a | s, w) (batch,), the density on [-1, 1]."""
