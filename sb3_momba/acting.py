@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
@@ -47,6 +48,11 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             raise ValueError("VecFrameStack stacks preferences too: leave it out, and stack frames inside PreferenceWrapper.")
         check_vec_env(venv)
         return venv
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(f"policy={policy_name!r} is not known: use one of {', '.join(self.policy_aliases)}, or a class.")
+        return self.policy_aliases[policy_name]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """SB3's; an environment with another number of objectives is refused before anything changes."""

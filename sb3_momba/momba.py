@@ -27,7 +27,7 @@ from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.nn.speed import keep_freed_memory, without_weight_gradients
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
-from sb3_momba.settings import HER_DEFAULTS, check_settings, parse_ent_coef
+from sb3_momba.settings import HER_DEFAULTS, check_other_arguments, check_settings, parameters, parse_ent_coef
 
 MAX_SKIPPED_UPDATES = 20
 Self = TypeVar("Self", bound="MOMBA")
@@ -73,6 +73,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param deterministic_exploration: collect data with the mean action (CAPQL's code) instead of a sample
     :param replay_buffer_class: PreferenceReplayBuffer or a subclass
     :param policy_kwargs: see SimbaPolicy, MlpPolicy and MombaPolicy
+    :param others: SAC's own arguments, such as use_sde, where they ask for nothing
     :raises ValueError: for settings or environments that do not go together, naming them
     """
 
@@ -121,7 +122,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **others: Any,
     ):
+        check_other_arguments(others, parameters(type(self)))
         if env is None and _init_setup_model:
             raise ValueError("env=None: MOMBA needs an environment to train on; MOMBA.load(path) needs none to predict.")
         super().__init__(
@@ -425,16 +428,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
         :raises FileFormatError: if no checkpoint is whole, naming what is damaged
         """
         return resume(cls, path, env, **kwargs)
-
-    def _excluded_save_params(self) -> list[str]:
-        derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor", "_metrics", "_negative_returns"]
-        of_the_process = ["_root_callback", "_states_of_callbacks", "_resumed_from"]
-        return [*super()._excluded_save_params(), *derived, *of_the_process]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        if self.ent_coef_optimizer is None:
-            return ["policy", "actor.optimizer", "critic.optimizer"], []
-        return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
 
 
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:

@@ -195,6 +195,16 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             buffer.end_episodes()
         self.replay_buffer = buffer
 
+    def _excluded_save_params(self) -> list[str]:
+        derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor", "_metrics", "_negative_returns"]
+        of_the_process = ["_root_callback", "_states_of_callbacks", "_resumed_from"]
+        return [*super()._excluded_save_params(), *derived, *of_the_process]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        if self.ent_coef_optimizer is None:
+            return ["policy", "actor.optimizer", "critic.optimizer"], []
+        return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
+
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:
         raise NotImplementedError
 

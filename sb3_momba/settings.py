@@ -33,10 +33,43 @@ NOT_FOR_USERS = {
     *INJECTED,
 }
 
+NO_SDE = "MOMBA explores by its policy's own noise, without gSDE; action_noise adds to it"
+# Arguments of SB3's SAC that MOMBA does not have: the value that asks for nothing, and what to do instead.
+OF_SAC = {
+    "use_sde": (False, NO_SDE),
+    "sde_sample_freq": (-1, NO_SDE),
+    "use_sde_at_warmup": (False, NO_SDE),
+    "target_update_interval": (1, "the target critics move with every update, by tau"),
+}
+OWN_FEATURES = (
+    "the networks read the whole observation, normalised, with the preference behind it. Extract features in the environment, "
+    "by an ObservationWrapper"
+)
+OF_SACS_POLICY = {
+    **dict.fromkeys(("use_sde", "log_std_init", "use_expln", "clip_mean"), NO_SDE),
+    **dict.fromkeys(("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"), OWN_FEATURES),
+    "normalize_images": "observations are vectors, and normalize_observations says whether they are normalised",
+}
+
+
+def check_other_arguments(others: Mapping[str, Any], known: Iterable[str]) -> None:
+    """What MOMBA's constructor does not take: SAC's own arguments at the value that asks for nothing pass.
+
+    :raises ValueError: for SAC's own arguments otherwise
+    :raises TypeError: for any other name, with the nearest one that there is
+    """
+    for name, value in others.items():
+        if name not in OF_SAC:
+            raise TypeError(f"MOMBA has no argument {name!r}{nearest(name, known)}")
+        nothing, cure = OF_SAC[name]
+        if value != nothing:
+            raise ValueError(f"{name}={value!r}: {cure}. Leave it out.")
+
 
 def check_settings(model: Any) -> None:
     """:param model: a MOMBA, whose attributes are its constructor's arguments"""
     settings = vars(model)
+    check_other_arguments({name: settings[name] for name in OF_SAC if name in settings}, OF_SAC)
     for name in SWITCHES:
         check_switch(name, settings[name])
     for name, least in WHOLE_NUMBERS.items():
@@ -96,6 +129,14 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
     if doubled:
         raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
     if policy in (SimbaPolicy, MlpPolicy):
+        for name in policy_kwargs:
+            if name in OF_SACS_POLICY:
+                raise ValueError(f"policy_kwargs {name}={policy_kwargs[name]!r}: {OF_SACS_POLICY[name]}.")
+            if policy is SimbaPolicy and name == "net_arch":
+                raise ValueError(
+                    f"policy_kwargs: SimbaPolicy has no {name}: its sizes are actor_hidden_dim, actor_blocks, "
+                    "critic_hidden_dim and critic_blocks. MlpPolicy has it."
+                )
         check_names("policy_kwargs", policy_kwargs, policy_parameters(policy), f"{policy.__name__} has no argument")
     for name, value in policy_kwargs.items():
         if name in POLICY_SWITCHES:

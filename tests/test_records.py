@@ -211,7 +211,7 @@ def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:
     assert (config["steps"], config["eval_freq"], config["n_episodes"], config["policy"]) == (120, 60, 2, "SimbaPolicy")
     written = config["hyperparameters"]
     arguments = inspect.signature(MOMBA.__init__).parameters
-    of_the_run = {"self", "policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}
+    of_the_run = {"self", "policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model", "others"}
     assert set(written) == set(arguments) - of_the_run
     for name in set(written) - {"policy_kwargs", *TINY}:
         assert written[name] == arguments[name].default, name

@@ -16,7 +16,9 @@ from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parame
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
 RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize")
 POLICIES = MOMBA.policy_aliases
-NOT_FOR_CONFIGURATIONS = {"self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model"}
+NOT_FOR_CONFIGURATIONS = {
+    *("self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model", "others"),
+}
 
 
 @dataclass
