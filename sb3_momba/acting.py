@@ -166,8 +166,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:  # those of another VecEnv
             self.action_noise = noise.base_noise
         noise_so_far = deepcopy(self.action_noise) if self._states_of_callbacks is not None else None
-        if reset_num_timesteps or self._last_obs is None:
+        resets = reset_num_timesteps or self._last_obs is None
+        if resets:
             self.policy.return_scale.end_episodes()
+        if resets or not self.replay_buffer.goes_on:
             self.replay_buffer.end_episodes()
         self.replay_buffer.check_memory()
         total_timesteps, root = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)

@@ -45,6 +45,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
     :param keep_probability: p_keep of hindsight relabelling, eq. (3.20); 1 switches it off
     :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
     :param seed: of the buffer's own random stream
+    :param handle_timeout_termination: SB3's switch, always on: a truncated episode's last state keeps its value
     """
 
     observation_space: spaces.Box
@@ -64,9 +65,12 @@ class PreferenceReplayBuffer(ReplayBuffer):
         keep_probability: float = 1.0,
         concentration: float = 5.0,
         seed: int | None = None,
+        handle_timeout_termination: bool = True,
     ):
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True cannot tell a truncated episode's last state: leave it False.")
+        if not handle_timeout_termination:
+            raise ValueError("handle_timeout_termination=False takes a truncated episode for a terminated one: leave it True.")
         if n_steps < 1:
             raise ValueError(f"n_steps={n_steps}: a return sums over at least 1 step.")
         if not 0 <= keep_probability <= 1 or concentration <= 0:
@@ -79,6 +83,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         raw_dim = observation_space.shape[0] - self.preference_dim
         raw_space = spaces.Box(observation_space.low[:raw_dim], observation_space.high[:raw_dim], dtype=np.float32)
         super().__init__(buffer_size, raw_space, action_space, device, n_envs)
+        self.goes_on = True  # whether what comes next belongs to the same episodes as the newest row
         self.n_added = 0  # rows since the training began, those overwritten among them
         self.rewards = np.zeros((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.preferences = np.ones((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
@@ -124,7 +129,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
 
         :param obs: [s, w], (n_envs, observation_dim + preference_dim): this w is the one that the action saw
         :param next_obs: [s', next w], like obs; before the reset where an episode has ended
-        :param reward: the scalar rewards, (n_envs,), used only where no PreferenceWrapper reports vectors
+        :param reward: the scalar rewards, (n_envs,), or as another buffer holds them, (n_envs, n_objectives); used only where
+            no PreferenceWrapper reports vectors
         :param infos: with `vector_reward` from PreferenceWrapper
         """
         vector_rewards = self._vector_rewards(reward, infos)
@@ -133,6 +139,11 @@ class PreferenceReplayBuffer(ReplayBuffer):
                 index = int((~np.isfinite(observations)).any(axis=1).argmax())
                 raise ValueError(f"Environment {index}: the observation {observations[index]} has a number that is not finite.")
         raw = self.observation_dim
+        if obs.shape[-1] != raw + self.preference_dim:
+            raise ValueError(
+                f"Observations of shape {obs.shape}: the buffer takes [observation, preference], "
+                f"{raw} + {self.preference_dim} wide."
+            )
         if "preference" in infos[0]:
             self._check_wrapper_order(obs[:, raw:], reward, vector_rewards, infos)
         if self.preference_dim > 0:
@@ -175,6 +186,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
                 unfinished &= np.isin(np.arange(self.n_envs), indices)
             self.dones[self.pos - 1][unfinished] = 1
             self.timeouts[self.pos - 1][unfinished] = 1
+        self.goes_on = True
 
     def _vector_rewards(self, reward: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         expected = (self.n_envs, self.n_objectives)
@@ -184,6 +196,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
                 if np.shape(vector) != expected[1:]:
                     raise ValueError(f"Environment {index}: vector_reward has shape {np.shape(vector)}, not {expected[1:]}.")
             rewards = np.array(vectors)
+        elif np.shape(reward) == expected:
+            rewards = np.asarray(reward, dtype=np.float32)
         elif self.n_objectives == 1:
             rewards = np.asarray(reward, dtype=np.float32)
             if rewards.shape != (self.n_envs,):

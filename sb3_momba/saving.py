@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
+from stable_baselines3.common.utils import get_system_info
 
 from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
 from sb3_momba.envs.wrappers import n_objectives_of
@@ -59,7 +60,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     def tree(self, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> dict[str, Any]:
         """What `save` writes."""
         module_names, tensor_names = self._get_torch_save_params()
-        excluded = set(exclude or ()) | (set(self._excluded_save_params()) - set(include or ()))
+        excluded = {*(exclude or ()), *self._excluded_save_params()} - set(include or ())
         excluded |= {name.split(".")[0] for name in [*module_names, *tensor_names]}
         return {
             **header(MODEL_FORMAT),
@@ -84,8 +85,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
 
         :param env: to train on or check against; not needed to predict
         :param custom_objects: attributes to use instead of those in the file, such as a learning-rate function that
-            could not be stored
-        :param print_system_info: print the library versions of the file
+            could not be stored; names that the model does not have are passed over, as in SB3
+        :param print_system_info: print the library versions here and of the file
         :param trust: read a zip that SB3 pickled, which can execute anything: only for files that you made yourself
         :param kwargs: attributes to change
         :raises FileFormatError: if the file is damaged or no model
@@ -95,7 +96,10 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)  # type: ignore[arg-type]
         tree = read_model(path)
         if print_system_info:
-            print(tree["versions"])
+            print("== CURRENT SYSTEM INFO ==")
+            get_system_info()
+            print("== SAVED MODEL SYSTEM INFO ==")
+            print("\n".join(f"- {name}: {version}" for name, version in tree["versions"].items()))
         data = {**tree["data"], **(custom_objects or {})}
         if "policy_kwargs" in kwargs and kwargs["policy_kwargs"] != data.get("policy_kwargs"):
             raise ValueError(
@@ -110,7 +114,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
                     "default stands in its place.",
                     stacklevel=2,
                 )
-        for name in ("policy_class", "observation_space", "action_space", "n_objectives", "policy_kwargs"):
+        for name in NEEDED:
             if name not in data:
                 raise ValueError(f"{name} was not stored: pass custom_objects={{{name!r}: ...}}.")
         for name in ("policy_class", *inspect.signature(cls.__init__).parameters):
@@ -125,7 +129,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
                 data["_last_obs"] = None
         with content_of(path):
             model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg, arg-type]
-        model.__dict__.update(data)
+        known = {*tree["data"], *NEEDED, *model.__dict__}
+        model.__dict__.update({name: value for name, value in data.items() if name in known})
         unknown = [name for name in kwargs if name not in model.__dict__]
         if unknown:
             raise ValueError(f"{cls.__name__} has no setting {unknown[0]!r}{nearest(unknown[0], model.__dict__)}")
@@ -172,7 +177,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     def load_replay_buffer(self, path: FilePath, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
         """Put the transitions of a file into a new replay buffer of the file's size.
 
-        :param truncate_last_traj: end the last trajectory where the file ends, as after `learn` with its usual reset
+        :param truncate_last_traj: the next `learn` ends the last trajectory where the file ends, as with its usual reset
         :raises ValueError: if they are of another environment
         """
         tree = read_format(with_existing_suffix(path, ".npz"), BUFFER_FORMAT)
@@ -191,8 +196,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         except BaseException:
             self.buffer_size = size_before
             raise
-        if truncate_last_traj:
-            buffer.end_episodes()
+        buffer.goes_on = not truncate_last_traj
+        buffer.device = self.device
         self.replay_buffer = buffer
 
     def _excluded_save_params(self) -> list[str]:
@@ -209,7 +214,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         raise NotImplementedError
 
     def _check_buffer_fits(self, tree: dict[str, Any]) -> None:
-        ours = self.replay_buffer
+        ours = self._make_replay_buffer() if self.replay_buffer is None else self.replay_buffer
         for name in ("n_objectives", "n_envs"):
             if tree[name] != getattr(ours, name):
                 raise ValueError(f"The file's buffer has {name}={tree[name]}, this model has {name}={getattr(ours, name)}.")
@@ -222,6 +227,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
             raise FileFormatError("The file's arrays do not have the length that it states.")
 
 
+NEEDED = ("policy_class", "observation_space", "action_space", "n_objectives", "policy_kwargs")
 # What an argument of a model that is a class may be.
 CLASSES_AT = {"policy_class": MombaPolicy, "replay_buffer_class": PreferenceReplayBuffer}
 

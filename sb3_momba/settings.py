@@ -22,7 +22,7 @@ CHOICES = {
     "critic_loss_reduction": ("sum", "mean"),
     "precision": PRECISIONS,
 }
-BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "seed")
+BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "seed", "handle_timeout_termination")
 HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0}
 
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
@@ -160,7 +160,7 @@ def check_support(support: Any) -> None:
 def check_net_arch(net_arch: Any) -> None:
     parts = net_arch.values() if isinstance(net_arch, dict) and set(net_arch) == {"pi", "qf"} else [net_arch]
     for widths in parts:
-        if not isinstance(widths, list | tuple) or not widths or not all(is_whole(width, 1) for width in widths):
+        if not isinstance(widths, list | tuple) or not all(is_whole(width, 1) for width in widths):
             raise ValueError(f"net_arch={net_arch!r}: give a list of widths such as [256, 256], or dict(pi=[...], qf=[...]).")
 
 

@@ -815,9 +815,12 @@ def test_a_loaded_replay_buffer_holds_and_draws_the_same(n_envs, n_timesteps, tm
 def test_loading_a_buffer_ends_its_last_trajectory_as_truncated(tmp_path):
     model = tiny_model(make_mo_vec_env(partial(StubEnv, episode_length=5), 2)).learn(14)
     model.save_replay_buffer(tmp_path / "buffer")
-    model.load_replay_buffer(tmp_path / "buffer")
-    np.testing.assert_array_equal(model.replay_buffer.dones[:7, 0], [0, 0, 0, 0, 1, 0, 1])
-    np.testing.assert_array_equal(model.replay_buffer.timeouts[:7, 0], [0, 0, 0, 0, 1, 0, 1])
+    for cut in (True, False):
+        model.load_replay_buffer(tmp_path / "buffer", truncate_last_traj=cut)
+        np.testing.assert_array_equal(model.replay_buffer.dones[:7, 0], [0, 0, 0, 0, 1, 0, 0])
+        model.learn(2, reset_num_timesteps=False)
+        np.testing.assert_array_equal(model.replay_buffer.dones[:7, 0], [0, 0, 0, 0, 1, 0, cut])
+        np.testing.assert_array_equal(model.replay_buffer.timeouts[:7, 0], [0, 0, 0, 0, 1, 0, cut])
     assert (model.replay_buffer.sample(50).dones == 0).all()
 
 

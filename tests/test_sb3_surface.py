@@ -1,11 +1,15 @@
 """What users of Stable-Baselines3's SAC reach for: its arguments, its calls, its errors."""
 
 import io
+from copy import deepcopy
 
+import numpy as np
 import pytest
+import torch as th
+from gymnasium import spaces
 
-from sb3_momba import MOMBA
-from tests.stubs import StubEnv, tiny_model
+from sb3_momba import MOMBA, make_mo_vec_env
+from tests.stubs import StubEnv, assert_same_tree, tiny_model
 
 
 @pytest.mark.parametrize(
@@ -54,3 +58,81 @@ def test_what_only_the_mlp_has_is_said_with_what_simba_has_instead(name):
 def test_a_policy_of_sac_that_momba_has_not_is_refused_with_those_that_it_has():
     with pytest.raises(ValueError, match="policy='CnnPolicy' is not known: use one of SimbaPolicy, MlpPolicy"):
         MOMBA("CnnPolicy", StubEnv())
+
+
+def test_networks_without_hidden_layers_are_linear_and_train():
+    model = tiny_model(StubEnv(), "MlpPolicy", vector_values=True, critic_loss="mse", policy_kwargs={"net_arch": []})
+    assert sum(parameter.numel() for parameter in model.actor.parameters()) == 2 * (3 + 2 + 1) * 2
+    assert sum(parameter.numel() for parameter in model.critic.parameters()) == 2 * (3 + 2 + 2 + 1) * 2
+    assert model.learn(30)._n_updates == 10
+
+
+UNKNOWN_SPACES = {"actions": {"action_space": spaces.Discrete(2)}, "observations": {"observation_space": spaces.MultiBinary(3)}}
+
+
+@pytest.mark.parametrize("space", UNKNOWN_SPACES.values(), ids=UNKNOWN_SPACES)
+def test_spaces_are_refused_as_our_own_error_and_as_that_of_sb3(space):
+    for kind in (ValueError, AssertionError):
+        with pytest.raises(kind, match="is not"):
+            tiny_model(StubEnv(**space))
+
+
+class WithoutOptions(StubEnv):
+    def reset(self, seed=None):
+        return super().reset(seed=seed)
+
+
+@pytest.mark.parametrize("n_objectives", [None, 2])
+def test_an_environment_whose_reset_takes_no_options_trains(n_objectives):
+    model = tiny_model(WithoutOptions(n_objectives)).learn(30)
+    assert model._n_updates == 10
+
+
+def test_what_is_included_is_saved_though_it_is_excluded_too():
+    file = io.BytesIO()
+    tiny_model(StubEnv(), verbose=0, gamma=0.5).save(file, exclude=["gamma", "tau"], include=["gamma"])
+    assert MOMBA.load(file).gamma == 0.5
+
+
+def test_custom_objects_replace_only_what_there_is(capsys):
+    file = io.BytesIO()
+    model = tiny_model(StubEnv())
+    model.save(file)
+    again = MOMBA.load(file, custom_objects={"learning_rate": 0.5, "dummy": 1.0}, print_system_info=True)
+    assert again.learning_rate == 0.5
+    assert not hasattr(again, "dummy")
+    assert "SAVED MODEL SYSTEM INFO" in capsys.readouterr().out
+
+
+def test_a_replay_buffer_is_loaded_where_there_is_none(tmp_path):
+    model = tiny_model(StubEnv()).learn(25)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    before, model.replay_buffer = model.replay_buffer, None
+    model.device = th.device("cuda")
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer.device.type == "cuda"
+    for name in ("observations", "actions", "rewards", "dones", "timeouts", "preferences"):
+        np.testing.assert_array_equal(getattr(model.replay_buffer, name), getattr(before, name))
+
+
+def test_a_replay_buffer_is_extended_by_what_another_holds():
+    model = tiny_model(StubEnv(1)).learn(25)
+    old, buffer = deepcopy(model.replay_buffer), model.replay_buffer
+    rows = [getattr(old, name)[:25] for name in ("observations", "next_observations", "actions", "rewards", "dones")]
+    buffer.extend(*rows, [[{"TimeLimit.truncated": bool(one)}] for one in old.timeouts[:25, 0]])
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        assert_same_tree(getattr(buffer, name)[25:50], getattr(buffer, name)[:25])
+
+
+def test_observations_without_their_preference_are_not_stored():
+    buffer = tiny_model(make_mo_vec_env(StubEnv)).learn(25).replay_buffer
+    row = [getattr(buffer, name)[0] for name in ("observations", "next_observations", "actions", "rewards", "dones")]
+    with pytest.raises(ValueError, match=r"the buffer takes \[observation, preference\], 3 \+ 2 wide"):
+        buffer.add(*row, [{}])
+    assert buffer.pos == 25
+
+
+def test_timeouts_are_always_told_from_ends():
+    tiny_model(StubEnv(), replay_buffer_kwargs={"handle_timeout_termination": True})
+    with pytest.raises(ValueError, match=r"handle_timeout_termination=False takes .*leave it True"):
+        tiny_model(StubEnv(), replay_buffer_kwargs={"handle_timeout_termination": False})

@@ -44,7 +44,7 @@ def test_a_setting_that_cannot_be_is_named(message):
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("net_arch", [[], [8, 0], 8, {"pi": [8]}], ids=str)
+@pytest.mark.parametrize("net_arch", [[8, 0], 8, {"pi": [8]}], ids=str)
 def test_widths_that_cannot_be_are_named(net_arch):
     with pytest.raises(ValueError, match=r"net_arch=.*: give a list of widths"):
         MOMBA("MlpPolicy", StubEnv(), buffer_size=10, policy_kwargs={"net_arch": net_arch})

@@ -118,7 +118,8 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             "rng": self._rng.bit_generator.state,
             "actions": [],
         }
-        observation, info = self.env.reset(seed=seed, options=options or None)
+        # As SB3 does it: an environment whose reset takes no options still works where none are given.
+        observation, info = self.env.reset(seed=seed, **({"options": options} if options else {}))
         self._episode_step = 0
         self._holds_for_episode = given is not None
         self._preference = given if given is not None else self._next_preference()
@@ -257,29 +258,33 @@ def count_objectives(env: gym.Env) -> int:
     return 1 if space is None else int(space.shape[0])
 
 
+class UnsupportedSpaceError(ValueError, AssertionError):
+    """Observations or actions that the policy does not know; SB3 raises AssertionError where it does not know a space."""
+
+
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """
-    :raises ValueError: where observations are not a one-dimensional Box, or actions not a bounded Box
+    :raises UnsupportedSpaceError: where observations are not a one-dimensional Box, or actions not a bounded Box
     """
     if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-        raise ValueError(
+        raise UnsupportedSpaceError(
             f"The observation space {observation_space} is not a one-dimensional Box: flatten it with "
             "gymnasium.wrappers.FlattenObservation, images after a feature extractor of your own."
         )
     if not isinstance(action_space, spaces.Box):
-        raise ValueError(f"The action space {action_space} is not supported: MOMBA needs continuous actions, a Box.")
+        raise UnsupportedSpaceError(f"The action space {action_space} is not supported: MOMBA needs continuous actions, a Box.")
     if len(action_space.shape) != 1 or action_space.shape[0] == 0:
-        raise ValueError(
+        raise UnsupportedSpaceError(
             f"The action space {action_space} has shape {action_space.shape}: flatten it to (n,) with an ActionWrapper."
         )
     low, high = action_space.low, action_space.high
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise ValueError(
+        raise UnsupportedSpaceError(
             f"The action space {action_space} has no finite bounds: MOMBA's policy covers [low, high]. Ask the environment for "
             "bounded actions (water-reservoir-v0: normalized_action=True) or put an ActionWrapper with a bounded Box around it."
         )
     if (low >= high).any():
-        raise ValueError(
+        raise UnsupportedSpaceError(
             f"The action space {action_space} has low >= high in dimension {int((low >= high).argmax())}: leave a constant "
             "action out of the space with an ActionWrapper."
         )

@@ -104,8 +104,8 @@ class MlpTrunk(Trunk):
         super().__init__(preference_dim, conditioning)
         self.features_dim = net_arch[-1] if net_arch else input_dim
         # The first layer reads the preference anyway, as part of the input.
-        widths = [input_dim, *(width + self.appended_dim for width in net_arch[:-1])]
-        self.layers = nn.ModuleList(Linear(*shape, n_members) for shape in zip(widths, net_arch, strict=True))
+        widths = [input_dim, *(width + self.appended_dim for width in net_arch)]
+        self.layers = nn.ModuleList(Linear(*shape, n_members) for shape in zip(widths, net_arch, strict=False))
         self.films = nn.ModuleList(Film(preference_dim, width, n_members) for width in net_arch if self.film_dim > 0)
 
     def forward(self, x: th.Tensor, preference: th.Tensor) -> th.Tensor:
