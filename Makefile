@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test lint known-fronts first-records evidence rounding speed torture clean
+.PHONY: demo test lint known-fronts first-records evidence rounding speed torture compat clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -40,6 +40,10 @@ rounding: $(VENV)/installed
 
 torture: $(VENV)/tools
 	$(ONE_THREAD) $(BIN)/python -m tests.torture
+
+# Stable-Baselines3's own tests with MOMBA in SAC's place.
+compat: $(VENV)/tools
+	$(ONE_THREAD) $(BIN)/python -m tests.compat
 
 speed: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark speed --threads 1
