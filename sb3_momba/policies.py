@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_device
+from torch import nn
 
 from sb3_momba.envs.preferences import preference_dim
 from sb3_momba.files import FileFormatError, FilePath, content_of, write_tree
@@ -207,11 +208,12 @@ class SimbaPolicy(MombaPolicy):
 
 
 class MlpPolicy(MombaPolicy):
-    """Dense networks with ReLU, as SB3's SAC has them (the MLP architecture of section 4.3).
+    """Dense networks, as SB3's SAC has them (the MLP architecture of section 4.3).
 
     :param net_arch: widths of the hidden layers, or `dict(pi=[...], qf=[...])` for actor and critics apart
     :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)
     :param ortho_init: orthogonal weights and zero biases at the start, as in CAPQL's code, instead of torch's own
+    :param activation_fn: between the layers
     :param kwargs: see MombaPolicy
     """
 
@@ -223,6 +225,7 @@ class MlpPolicy(MombaPolicy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         conditioning: str = "input",
         ortho_init: bool = False,
+        activation_fn: type[nn.Module] = nn.ReLU,
         **kwargs: Any,
     ):
         if net_arch is None:
@@ -232,8 +235,8 @@ class MlpPolicy(MombaPolicy):
             observation_space,
             action_space,
             lr_schedule,
-            MlpArchitecture(arch["pi"], conditioning, ortho_init),
-            MlpArchitecture(arch["qf"], conditioning, ortho_init),
+            MlpArchitecture(arch["pi"], conditioning, ortho_init, activation_fn),
+            MlpArchitecture(arch["qf"], conditioning, ortho_init, activation_fn),
             normalize_weights=False,
             **kwargs,
         )
@@ -241,5 +244,6 @@ class MlpPolicy(MombaPolicy):
             "net_arch": net_arch,
             "conditioning": conditioning,
             "ortho_init": ortho_init,
+            "activation_fn": activation_fn,
             **kwargs,
         }

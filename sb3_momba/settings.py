@@ -7,6 +7,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.nn.products import PRECISIONS
@@ -132,7 +133,7 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
         for name in policy_kwargs:
             if name in OF_SACS_POLICY:
                 raise ValueError(f"policy_kwargs {name}={policy_kwargs[name]!r}: {OF_SACS_POLICY[name]}.")
-            if policy is SimbaPolicy and name == "net_arch":
+            if policy is SimbaPolicy and name in ("net_arch", "activation_fn"):
                 raise ValueError(
                     f"policy_kwargs: SimbaPolicy has no {name}: its sizes are actor_hidden_dim, actor_blocks, "
                     "critic_hidden_dim and critic_blocks. MlpPolicy has it."
@@ -149,6 +150,9 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
         check_support(policy_kwargs["support"])
     if policy_kwargs.get("net_arch") is not None:
         check_net_arch(policy_kwargs["net_arch"])
+    activation = policy_kwargs.get("activation_fn", nn.ReLU)
+    if not isinstance(activation, type) or not issubclass(activation, nn.Module):
+        raise ValueError(f"policy_kwargs activation_fn={activation!r}: give a class of torch.nn, such as torch.nn.Tanh.")
 
 
 def check_support(support: Any) -> None:

@@ -18,9 +18,9 @@ VARIANTS = {
     "SimbaPolicy": {"policy": "SimbaPolicy"},
     "SimbaPolicy, vector, film": {"policy": "SimbaPolicy", "vector_values": True, "policy_kwargs": {"conditioning": "film"}},
     "MlpPolicy, mse": {"policy": "MlpPolicy", "critic_loss": "mse", "policy_kwargs": {"net_arch": {"pi": [4], "qf": [5, 6]}}},
-    "MlpPolicy, SGD": {
+    "MlpPolicy, SiLU, SGD": {
         **{"policy": "MlpPolicy", "best_return_scale": None},
-        "policy_kwargs": {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.5}},
+        "policy_kwargs": {"activation_fn": th.nn.SiLU, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.5}},
     },
     "CAPQL's log pi": {"policy": "MlpPolicy", "policy_kwargs": {"capql_log_prob": True, "n_critics": 3, "ortho_init": True}},
 }

@@ -49,7 +49,7 @@ def test_arguments_of_sacs_policy_are_refused_with_a_cure(policy, name, value):
         tiny_model(StubEnv(), policy, policy_kwargs={name: value})
 
 
-@pytest.mark.parametrize("name", ["net_arch"])
+@pytest.mark.parametrize("name", ["net_arch", "activation_fn"])
 def test_what_only_the_mlp_has_is_said_with_what_simba_has_instead(name):
     with pytest.raises(ValueError, match=rf"SimbaPolicy has no {name}: its sizes are .*MlpPolicy has it"):
         tiny_model(StubEnv(), policy_kwargs={name: [8]})
@@ -58,6 +58,12 @@ def test_what_only_the_mlp_has_is_said_with_what_simba_has_instead(name):
 def test_a_policy_of_sac_that_momba_has_not_is_refused_with_those_that_it_has():
     with pytest.raises(ValueError, match="policy='CnnPolicy' is not known: use one of SimbaPolicy, MlpPolicy"):
         MOMBA("CnnPolicy", StubEnv())
+
+
+@pytest.mark.parametrize("activation_fn", ["tanh", th.tanh, th.optim.Adam], ids=str)
+def test_an_activation_is_a_class_of_torch(activation_fn):
+    with pytest.raises(ValueError, match=r"activation_fn=.*such as torch\.nn\.Tanh"):
+        tiny_model(StubEnv(), "MlpPolicy", policy_kwargs={"activation_fn": activation_fn})
 
 
 def test_networks_without_hidden_layers_are_linear_and_train():

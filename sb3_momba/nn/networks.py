@@ -91,7 +91,7 @@ class SimbaTrunk(Trunk):
 
 
 class MlpTrunk(Trunk):
-    """Dense layers with ReLU, as in SB3's SAC; a layer is a block."""
+    """Dense layers, by default with ReLU, as in SB3's SAC; a layer is a block."""
 
     def __init__(
         self,
@@ -99,9 +99,11 @@ class MlpTrunk(Trunk):
         preference_dim: int,
         net_arch: list[int],
         conditioning: str = "input",
+        activation_fn: type[nn.Module] = nn.ReLU,
         n_members: int | None = None,
     ):
         super().__init__(preference_dim, conditioning)
+        self.activation = activation_fn()
         self.features_dim = net_arch[-1] if net_arch else input_dim
         # The first layer reads the preference anyway, as part of the input.
         widths = [input_dim, *(width + self.appended_dim for width in net_arch)]
@@ -110,7 +112,7 @@ class MlpTrunk(Trunk):
 
     def forward(self, x: th.Tensor, preference: th.Tensor) -> th.Tensor:
         for i, layer in enumerate(self.layers):
-            x = F.relu(layer(x if i == 0 else self.append(x, preference)))
+            x = self.activation(layer(x if i == 0 else self.append(x, preference)))
             if self.film_dim > 0:
                 x = self.films[i](x, preference)
         return x
@@ -140,13 +142,14 @@ class SimbaArchitecture:
 
 
 class MlpArchitecture:
-    """SB3 SAC's networks: dense layers with ReLU, linear heads, log std clamped to [-20, 2]."""
+    """SB3 SAC's networks: dense layers, by default with ReLU, linear heads, log std clamped to [-20, 2]."""
 
-    def __init__(self, net_arch: list[int], conditioning: str, ortho_init: bool):
-        self.net_arch, self.conditioning, self.ortho_init = net_arch, conditioning, ortho_init
+    def __init__(self, net_arch: list[int], conditioning: str, ortho_init: bool, activation_fn: type[nn.Module] = nn.ReLU):
+        self.net_arch, self.conditioning = net_arch, conditioning
+        self.ortho_init, self.activation_fn = ortho_init, activation_fn
 
     def trunk(self, input_dim: int, preference_dim: int, n_members: int | None) -> Trunk:
-        trunk = MlpTrunk(input_dim, preference_dim, self.net_arch, self.conditioning, n_members)
+        trunk = MlpTrunk(input_dim, preference_dim, self.net_arch, self.conditioning, self.activation_fn, n_members)
         if self.ortho_init:
             for layer in trunk.layers:
                 orthogonal_(layer)
