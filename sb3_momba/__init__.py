@@ -2,7 +2,7 @@
 
 __version__ = "0.1.0"
 
-import sb3_momba.envs.pgmorl  # noqa: F401  registers the tasks of the thesis
+import sb3_momba.envs.registry  # noqa: F401  registers the tasks of the thesis, and momba/ ids
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.envs.checking import check_mo_env

@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_momba.envs.registry import raw_id
 from sb3_momba.files import FileFormatError, qualified_name, refuse_constant
 from sb3_momba.system import git_revision, library_versions, machine
 
@@ -193,9 +194,9 @@ class Record:
 
     @property
     def task(self) -> str:
-        """The environment, with the arguments that it was made with."""
+        """The environment, `momba/` or raw, with the arguments that it was made with."""
         arguments = ", ".join(f"{name}={value}" for name, value in sorted(self.env_kwargs.items()))
-        return f"{self.env} ({arguments})" if arguments else self.env
+        return f"{raw_id(self.env)} ({arguments})" if arguments else raw_id(self.env)
 
 
 def find_records(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:

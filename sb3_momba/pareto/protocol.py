@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+from sb3_momba.envs.registry import raw_id
+
 N_PREFERENCES = 100
 N_EPISODES = 5
 
@@ -18,5 +20,8 @@ REFERENCE_POINTS = {
 
 
 def reference_point_of(env_id: str, n_objectives: int) -> Sequence[float]:
-    """The task's reference point, 0 for a task that has none here, (n_objectives,)."""
-    return REFERENCE_POINTS.get(env_id, (0.0,) * n_objectives)
+    """The task's reference point, 0 for a task that has none here, (n_objectives,).
+
+    :param env_id: the task's own, or with the prefix of those that carry PreferenceWrapper
+    """
+    return REFERENCE_POINTS.get(raw_id(env_id), (0.0,) * n_objectives)

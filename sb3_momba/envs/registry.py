@@ -1,0 +1,59 @@
+"""Gymnasium ids whose environments carry PreferenceWrapper, `momba/<id>` beside the raw ones.
+
+`gymnasium.make("momba/mo-hopper-2obj-v5")` has the observation [s, w] and the reward w.r, a number: what makes environments
+from ids alone, and wraps them into Monitor, can use it as any other. No environment's module is imported here.
+"""
+
+import gymnasium as gym
+import mo_gymnasium  # noqa: F401  registers its environments' ids
+from gymnasium.envs.registration import WrapperSpec
+
+from sb3_momba.envs.pgmorl import TASKS
+
+PREFIX = "momba/"
+WRAPPER = WrapperSpec("PreferenceWrapper", "sb3_momba.envs.wrappers:PreferenceWrapper", {"preference_sampler": None})
+
+# MO-Gymnasium's tasks with one-dimensional observations and continuous actions.
+CONTINUOUS = (
+    *("mo-ant-v4", "mo-ant-v5", "mo-ant-2d-v4", "mo-ant-2obj-v5", "mo-halfcheetah-v4", "mo-halfcheetah-v5"),
+    *("mo-hopper-v4", "mo-hopper-v5", "mo-hopper-2d-v4", "mo-hopper-2obj-v5", "mo-humanoid-v4", "mo-humanoid-v5"),
+    *("mo-lunar-lander-continuous-v3", "mo-mountaincarcontinuous-v0", "mo-swimmer-v4", "mo-swimmer-v5"),
+    *("mo-walker2d-v4", "mo-walker2d-v5", "water-reservoir-v0"),
+)
+NEEDED_ARGUMENTS = {"water-reservoir-v0": {"normalized_action": True}}  # Its actions have no bounds otherwise.
+
+
+def preference_id(env_id: str) -> str:
+    """The id of the same task inside PreferenceWrapper, registered if it was not yet.
+
+    :param env_id: of any registered environment; one that has the wrapper already stays as it is, and so does an id that
+        nobody knows
+    """
+    if env_id not in gym.registry:
+        return env_id
+    spec = gym.registry[env_id]
+    if any(wrapper.name == WRAPPER.name for wrapper in spec.additional_wrappers):
+        return env_id
+    wrapped_id = PREFIX + env_id.replace("/", ".")  # An id has one namespace.
+    if wrapped_id not in gym.registry:
+        gym.register(
+            wrapped_id,
+            entry_point=spec.entry_point,
+            reward_threshold=spec.reward_threshold,
+            nondeterministic=spec.nondeterministic,
+            max_episode_steps=spec.max_episode_steps,
+            order_enforce=spec.order_enforce,
+            disable_env_checker=True,  # It does not know vector rewards.
+            additional_wrappers=(*spec.additional_wrappers, WRAPPER),
+            kwargs={**spec.kwargs, **NEEDED_ARGUMENTS.get(env_id, {})},
+        )
+    return wrapped_id
+
+
+def raw_id(env_id: str) -> str:
+    """The task's own id: "momba/mo-hopper-2obj-v5" -> "mo-hopper-2obj-v5"; any other id as it is."""
+    return env_id.removeprefix(PREFIX)
+
+
+for _task in (*CONTINUOUS, *TASKS):
+    preference_id(_task)
