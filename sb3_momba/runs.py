@@ -140,6 +140,7 @@ def run(settings: RunSettings) -> RunResult:
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
     with prepared(settings) as ready, alone_in(folder):
         model, evaluation = ready.model, ready.evaluation
+        assert evaluation.eval_env is not None
         sizes = {
             "actor": sum(p.numel() for p in model.actor.parameters()),
             "critic": sum(p.numel() for p in model.critic.parameters()),

@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.env_util import is_wrapped, make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_momba import MOMBA, PreferenceWrapper, evaluate_front
+from sb3_momba import MOMBA, ParetoEvalCallback, PreferenceWrapper, evaluate_front, make_mo_vec_env
 from sb3_momba.envs.pgmorl import TASKS
-from sb3_momba.envs.registry import CONTINUOUS, NEEDED_ARGUMENTS, preference_id, raw_id
+from sb3_momba.envs.registry import CONTINUOUS, NEEDED_ARGUMENTS, copies_of, preference_id, raw_id
 from sb3_momba.envs.wrappers import make_env
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
 from sb3_momba.records import Record
@@ -97,3 +99,46 @@ print([name for name in sys.modules if name.startswith(wanted)])
 """
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == "[]"
+
+
+# ---------------------------------------------------------------------------------------- copies of the training environment
+
+
+@pytest.mark.parametrize("env_id", ["MO-Swimmer-v4", "momba/MO-Swimmer-v4"])
+def test_the_callback_makes_its_own_environment(env_id: str) -> None:
+    env = make_mo_vec_env(env_id, 2, env_kwargs={"physics": "current"})
+    callback = ParetoEvalCallback(eval_freq=10, n_preferences=2, n_episodes=1)
+    MOMBA("SimbaPolicy", env, **TINY).learn(20, callback)
+    assert callback.timesteps == [10, 20]
+    own = callback.eval_env()
+    assert own.unwrapped.physics == "current"
+    assert is_wrapped(own, PreferenceWrapper)
+    assert not is_wrapped(own, Monitor)
+    assert own.unwrapped is not env.envs[0].unwrapped
+
+
+def test_environments_in_processes_are_copied_too() -> None:
+    env = make_mo_vec_env("MO-Swimmer-v4", 1, vec_env_cls=SubprocVecEnv)
+    try:
+        assert copies_of(env)().spec.id == "MO-Swimmer-v4"
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (StubEnv, "The environment has no spec .* Give ParetoEvalCallback an eval_env"),
+        (lambda: Unrecordable(gym.make("MO-Swimmer-v4")), "MO-Swimmer-v4 has a wrapper .* Unrecordable does not inherit"),
+    ],
+)
+def test_what_cannot_be_copied_is_an_error_before_the_training(env, message: str) -> None:
+    model = MOMBA("SimbaPolicy", env(), **TINY)
+    callback = ParetoEvalCallback(n_preferences=2)
+    with pytest.raises(ValueError, match=message):
+        model.learn(20, callback)
+    callback.on_training_end()  # as rl_zoo3 does, whatever happened
+
+
+class Unrecordable(gym.Wrapper):
+    pass

@@ -1,12 +1,17 @@
-"""Gymnasium ids whose environments carry PreferenceWrapper, `momba/<id>` beside the raw ones.
+"""Gymnasium ids whose environments carry PreferenceWrapper, `momba/<id>` beside the raw ones, and environments made anew.
 
 `gymnasium.make("momba/mo-hopper-2obj-v5")` has the observation [s, w] and the reward w.r, a number: what makes environments
 from ids alone, and wraps them into Monitor, can use it as any other. No environment's module is imported here.
 """
 
+import copy
+from collections.abc import Callable
+from functools import partial
+
 import gymnasium as gym
 import mo_gymnasium  # noqa: F401  registers its environments' ids
 from gymnasium.envs.registration import WrapperSpec
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_momba.envs.pgmorl import TASKS
 
@@ -53,6 +58,27 @@ def preference_id(env_id: str) -> str:
 def raw_id(env_id: str) -> str:
     """The task's own id: "momba/mo-hopper-2obj-v5" -> "mo-hopper-2obj-v5"; any other id as it is."""
     return env_id.removeprefix(PREFIX)
+
+
+def copies_of(venv: VecEnv) -> Callable[[], gym.Env]:
+    """A function that makes environments such as the first one of a VecEnv, with all its wrappers but Monitor, and without
+    a window.
+
+    :raises ValueError: if Gymnasium did not make that one, or a wrapper cannot be made anew
+    """
+    spec = venv.get_attr("spec", indices=[0])[0]
+    if spec is None:
+        raise ValueError("The environment has no spec to make another one from: gymnasium.make did not make it.")
+    spec = copy.copy(spec)
+    spec.additional_wrappers = tuple(wrapper for wrapper in spec.additional_wrappers if wrapper.name != "Monitor")
+    spec.kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    for wrapper in spec.additional_wrappers:
+        if wrapper.kwargs is None:
+            raise ValueError(
+                f"{spec.id} has a wrapper that cannot be made anew: {wrapper.name} does not inherit from "
+                "gymnasium.utils.RecordConstructorArgs."
+            )
+    return partial(gym.make, spec, disable_env_checker=True)
 
 
 for _task in (*CONTINUOUS, *TASKS):

@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.envs.registry import copies_of
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_front, probe_environment
 from sb3_momba.pareto.metrics import hypervolume
@@ -41,7 +42,8 @@ class ParetoEvalCallback(EventCallback):
     the front's picture where the logger takes figures. `last_mean_reward` and `best_mean_reward` are hypervolumes (mean
     returns where there is one objective), so that callbacks made for SB3's EvalCallback work.
 
-    :param eval_env: id, callable, environment or VecEnv; see `evaluate_front`
+    :param eval_env: id, callable, environment or VecEnv; see `evaluate_front`. By default copies of the training environment,
+        which must come from an id, and its wrappers from Gymnasium's recordable ones
     :param eval_freq: environment steps, over all training environments
     :param reference_point: of the hypervolume, (n_objectives,); 0 by default
     :param log_path: folder for `pareto_evaluations.npz`, `front.npz` and `front.png`
@@ -53,7 +55,7 @@ class ParetoEvalCallback(EventCallback):
 
     def __init__(
         self,
-        eval_env: str | gym.Env | VecEnv | Callable[[], gym.Env],
+        eval_env: str | gym.Env | VecEnv | Callable[[], gym.Env] | None = None,
         eval_freq: int = 50_000,
         n_preferences: int = N_PREFERENCES,
         n_episodes: int = N_EPISODES,
@@ -74,6 +76,7 @@ class ParetoEvalCallback(EventCallback):
         if n_workers < 1:
             raise ValueError(f"n_workers={n_workers}: at least one process is needed.")
         self.eval_env = eval_env
+        self.copies_training_env = eval_env is None
         self.eval_freq = int(eval_freq)
         self.evaluation_kwargs: dict[str, Any] = {
             "n_preferences": n_preferences,
@@ -96,14 +99,15 @@ class ParetoEvalCallback(EventCallback):
         self.best_mean_reward = -np.inf
         self.best_score = (-np.inf, -np.inf)  # hypervolume, then expected utility
         self.warned_of_reference_point = False
+        self.is_evaluated = True  # whether the model of this moment is; there is none yet
 
     def _init_callback(self) -> None:
-        self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
-        self.go_on = True
-        self.is_evaluated = False  # whether the model of this moment is
-        if shares_environment(self.eval_env, self.training_env):
+        if self.eval_env is not None and shares_environment(self.eval_env, self.training_env):
             raise ValueError("eval_env is the training environment, whose episodes an evaluation would end: give it its own.")
         self.check(self.model)
+        self.next_evaluation = (self.model.num_timesteps // self.eval_freq + 1) * self.eval_freq
+        self.go_on = True
+        self.is_evaluated = False
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.parent = self
             self.callback_on_new_best.init_callback(self.model)
@@ -113,12 +117,25 @@ class ParetoEvalCallback(EventCallback):
 
         :raises ValueError: for an environment, a reference point or names that do not fit the model
         """
+        if self.copies_training_env:
+            try:
+                self.eval_env = copies_of(model.get_env())
+            except ValueError as error:
+                raise ValueError(f"{error} Give ParetoEvalCallback an eval_env, such as an id.") from error
+        assert self.eval_env is not None
         n_objectives = check_model_fits(model, probe_environment(self.eval_env))
         preference_grid(n_objectives, self.evaluation_kwargs["n_preferences"])
         if self.reference_point is not None:
             hypervolume(np.zeros((1, n_objectives)), self.reference_point)
         if self.objectives is not None and len(self.objectives) != n_objectives:
             raise ValueError(f"objectives={self.objectives}: {n_objectives} names are needed, one per objective.")
+
+    @property
+    def scores(self) -> list[float]:
+        """Of each evaluation, what `last_mean_reward` was: hypervolumes, or mean returns where there is one objective."""
+        # With one objective the hypervolume above 0 says nothing that the mean return does not.
+        is_vector = self.front is not None and self.front.n_objectives > 1
+        return [measured["hypervolume" if is_vector else "expected_utility"] for measured in self.metrics]
 
     def state_dict(self) -> dict[str, Any]:
         """For a checkpoint: what has been measured, and when to measure next."""
@@ -154,8 +171,7 @@ class ParetoEvalCallback(EventCallback):
         self.timesteps.append(self.num_timesteps)
         self.metrics.append(measured)
         self.values.append(front.values)
-        # With one objective the hypervolume above 0 says nothing that the mean return does not.
-        self.last_mean_reward = measured["hypervolume" if front.n_objectives > 1 else "expected_utility"]
+        self.last_mean_reward = self.scores[-1]
         score = (self.last_mean_reward, measured["expected_utility"])
         if front.n_objectives > 1 and measured["hypervolume"] == 0 and not self.warned_of_reference_point:
             self.warned_of_reference_point = True
