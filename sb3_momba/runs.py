@@ -29,7 +29,7 @@ from sb3_momba.pareto.metrics import summarise
 from sb3_momba.records import FILE_NAME as RECORD_NAME
 from sb3_momba.records import RecordWriter, plain, read_record
 from sb3_momba.settings import check_whole
-from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
+from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults, with_schedules
 
 CHECKPOINTS = "checkpoints"
 # No result depends on them.
@@ -125,7 +125,8 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
         if resumed:
             model = MOMBA.resume(folder / CHECKPOINTS, env, device=settings.device)
         else:
-            model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **settings.hyperparameters)
+            hyperparameters = with_schedules(settings.hyperparameters)
+            model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **hyperparameters)
         evaluation.check(model)
         preferences = preference_grid(model.n_objectives, settings.n_preferences)
         yield Prepared(model, evaluation, record, preferences, reference_point)

@@ -19,7 +19,14 @@ import yaml
 from sb3_momba.pareto import protocol
 from sb3_momba.records import plain
 from sb3_momba.runs import RunResult, RunSettings, resume, run
-from sb3_momba.zoo.configuration import Configuration, literal, read_configuration, shipped_configurations, with_defaults
+from sb3_momba.zoo.configuration import (
+    N_TIMESTEPS,
+    Configuration,
+    literal,
+    read_configuration,
+    shipped_configurations,
+    with_defaults,
+)
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
 
@@ -101,14 +108,14 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         "ent_coef": given.ent_coef,
     }
     hyperparameters.update({name: value for name, value in options.items() if value is not None})
-    env_kwargs: dict[str, Any] = {}
+    env_kwargs = configuration.env_kwargs
     for assignments, option, values in ((given.set, "--set", hyperparameters), (given.env_kwargs, "--env-kwargs", env_kwargs)):
         for assignment in assignments:
             assign(values, assignment, option)
     return RunSettings(
         env=given.env,
         output=given.output or f"runs/{given.env}/{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
-        steps=first_given(given.steps, configuration.n_timesteps, 1_000_000),
+        steps=first_given(given.steps, configuration.n_timesteps, N_TIMESTEPS),
         seed=given.seed,
         policy=ARCHITECTURES[given.architecture] if given.architecture else configuration.policy,
         label=given.label or (Path(given.conf).stem if given.conf else "momba"),

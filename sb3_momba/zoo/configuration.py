@@ -1,24 +1,34 @@
 """Reading hyperparameters from yaml in rl_zoo3's format. Values are literals: nothing is evaluated."""
 
 import inspect
+import logging
 from collections.abc import Container
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_momba.envs.registry import PREFIX, raw_id
 from sb3_momba.momba import MOMBA
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parameters, policy_parameters
 
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
-RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize")
+RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize", "env_kwargs", "callback")
+# What only rl_zoo3 can do; `callback` is left to it too, but changes no model.
+ZOO_KEYS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "monitor_kwargs", "noise_type", "noise_std")
+EVALUATED_BY_RL_ZOO3 = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "monitor_kwargs", "normalize")
+LINEAR = "lin_"
+N_TIMESTEPS = 1_000_000  # where neither file nor command line says
 POLICIES = MOMBA.policy_aliases
 NOT_FOR_CONFIGURATIONS = {
     *("self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model", "others"),
 }
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -29,11 +39,42 @@ class Configuration:
     hyperparameters: dict[str, Any]
     n_timesteps: int | None = None
     n_envs: int = 1
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
 
 
 def shipped_configurations() -> list[str]:
     """Names of the files that come with the package."""
     return sorted(file.name.removesuffix(".yml") for file in SHIPPED.iterdir() if file.name.endswith(".yml"))
+
+
+def find_file(name: str) -> Path:
+    """The yaml file of a path, or of a shipped configuration's name.
+
+    :raises ValueError: for neither, with the nearest shipped name
+    """
+    if name in shipped_configurations():
+        return Path(str(SHIPPED / f"{name}.yml"))
+    if not Path(name).is_file():
+        known = nearest(name, shipped_configurations())
+        raise ValueError(f"{name!r} is neither a yaml file nor a shipped configuration{known}")
+    return Path(name)
+
+
+def find_entry(name: str, env_id: str) -> tuple[str, dict[str, Any]]:
+    """The key and the values of an environment's entry in a yaml file: its id as given, raw, with `momba/`, or `default`.
+
+    :param name: path of a yaml file, or name of a shipped one, such as "capql"
+    :raises ValueError: for a file that is no yaml, or has no entry
+    """
+    try:
+        entries = yaml.safe_load(find_file(name).read_text())
+    except yaml.YAMLError as error:
+        said = " ".join(str(error).split())
+        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {said}") from error
+    for key in (env_id, raw_id(env_id), PREFIX + raw_id(env_id), "default"):
+        if isinstance(entries, dict) and isinstance(entries.get(key), dict):
+            return key, entries[key]
+    raise ValueError(f"{name} has no entry {env_id!r} and no 'default'.")
 
 
 def read_configuration(name: str, env_id: str) -> Configuration:
@@ -42,32 +83,57 @@ def read_configuration(name: str, env_id: str) -> Configuration:
     :param name: path of a yaml file, or name of a shipped one, such as "capql"
     :raises ValueError: for a missing file or entry, and for unknown keys, with the nearest known name
     """
-    if name in shipped_configurations():
-        text = (SHIPPED / f"{name}.yml").read_text()
-    elif Path(name).is_file():
-        text = Path(name).read_text()
-    else:
-        raise ValueError(
-            f"{name!r} is neither a yaml file nor a shipped configuration{nearest(name, shipped_configurations())}"
-        )
-    try:
-        entries = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        said = " ".join(str(error).split())
-        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {said}") from error
-    entry = entries.get(env_id, entries.get("default")) if isinstance(entries, dict) else None
-    if not isinstance(entry, dict):
-        raise ValueError(f"{name} has no entry {env_id!r} and no 'default'.")
-    entry = literal(entry)
-    if entry.pop("normalize", False):
+    entry = check_entry(name, find_entry(name, env_id)[1])
+    for key in ZOO_KEYS:
+        if entry.get(key) is not None:
+            raise ValueError(f"{name}: {key} needs rl_zoo3: train with python -m sb3_momba.zoo train, or leave it out.")
+    if entry.get("callback"):
+        logger.warning("%s: callback is left to python -m sb3_momba.zoo; here --eval-freq and its like say what is done.", name)
+    hyperparameters = {key: value for key, value in entry.items() if key not in (*RUN_KEYS, *ZOO_KEYS)}
+    return Configuration(
+        entry["policy"], hyperparameters, entry.get("n_timesteps"), entry.get("n_envs", 1), entry.get("env_kwargs") or {}
+    )
+
+
+def check_entry(name: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """An entry of a yaml file with numbers for numbers and the default policy.
+
+    :param name: of the file, for messages
+    :raises ValueError: for what cannot be, and for unknown keys, with the nearest known name
+    """
+    entry = {"policy": "SimbaPolicy", **literal(entry)}
+    for key in EVALUATED_BY_RL_ZOO3:
+        if isinstance(entry.get(key), str):
+            raise ValueError(f"{name}: {key}={entry[key]!r} is Python code, and nothing is evaluated: write a mapping.")
+    if entry.get("normalize"):
         raise ValueError(f"{name}: normalize must be false: the policy normalises observations and rewards itself.")
-    policy = entry.pop("policy", "SimbaPolicy")
-    n_timesteps, n_envs = entry.pop("n_timesteps", None), entry.pop("n_envs", 1)
-    for key, value in (("n_timesteps", n_timesteps), ("n_envs", n_envs)):
-        if value is not None:  # yaml's 1e6 is a float
-            check_whole(f"{name}: {key}", int(value) if isinstance(value, float) and value.is_integer() else value, 1)
-    check_hyperparameters(policy, entry)
-    return Configuration(policy, entry, None if n_timesteps is None else int(n_timesteps), n_envs)
+    for key in ("n_timesteps", "n_envs"):
+        if key in entry:
+            if isinstance(entry[key], float) and entry[key].is_integer():  # !!float 1e6
+                entry[key] = int(entry[key])
+            check_whole(f"{name}: {key}", entry[key], 1)
+    own = {key: value for key, value in entry.items() if key not in (*RUN_KEYS, *ZOO_KEYS)}
+    check_hyperparameters(entry["policy"], own)
+    return entry
+
+
+def with_schedules(hyperparameters: dict[str, Any]) -> dict[str, Any]:
+    """A learning rate "lin_3e-4" falls linearly from 3e-4 to 0, as in rl_zoo3.
+
+    :raises ValueError: for any other string
+    """
+    rate = hyperparameters.get("learning_rate")
+    if not isinstance(rate, str):
+        return hyperparameters
+    try:
+        start = float(rate.removeprefix(LINEAR))
+        if not start >= 0:
+            raise ValueError("out of range")
+    except ValueError as error:
+        raise ValueError(
+            f"learning_rate={rate!r}: give a number of at least 0, or {LINEAR}3e-4 to fall from it to 0."
+        ) from error
+    return {**hyperparameters, "learning_rate": LinearSchedule(start, 0.0, 1.0)}
 
 
 def literal(value: Any) -> Any:
@@ -92,7 +158,7 @@ def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
     known = [name for name in parameters(MOMBA) if name not in NOT_FOR_CONFIGURATIONS]
     for name in hyperparameters:
         if name not in known:
-            raise ValueError(f"MOMBA has no hyperparameter {name!r}{nearest(name, [*known, *RUN_KEYS])}")
+            raise ValueError(f"MOMBA has no hyperparameter {name!r}{nearest(name, [*known, *RUN_KEYS, *ZOO_KEYS])}")
     check_policy_kwargs(POLICIES[policy], hyperparameters.get("policy_kwargs") or {})
 
 

@@ -1,0 +1,58 @@
+"""Yaml files in rl_zoo3's format, read without rl_zoo3."""
+
+import pytest
+import yaml
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_momba.train import parse
+from sb3_momba.zoo.configuration import check_entry, find_entry, read_configuration, with_schedules
+
+TASK = "mo-hopper-2obj-v5"
+
+
+def test_entries_are_found_under_both_kinds_of_ids(tmp_path) -> None:
+    path = tmp_path / "two.yml"
+    path.write_text(yaml.dump({f"momba/{TASK}": {"gamma": 0.9}, "MO-Ant-v4": {"gamma": 0.8}, "default": {"gamma": 0.7}}))
+    found = [find_entry(str(path), name)[1]["gamma"] for name in (TASK, f"momba/{TASK}", "momba/MO-Ant-v4", "MO-Hopper-v4")]
+    assert found == [0.9, 0.9, 0.8, 0.7]
+
+
+def test_the_environments_arguments_come_from_the_file_and_the_command_line(tmp_path) -> None:
+    path = tmp_path / "env.yml"
+    path.write_text(yaml.dump({"default": {"env_kwargs": {"physics": "current", "width": 64}}}))
+    assert parse(["--env", "MO-Ant-v4", "--conf", str(path), "--env-kwargs", "width=32"]).env_kwargs == {
+        "physics": "current",
+        "width": 32,
+    }
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"policy_kwargs": "dict(n_atoms=5)"}, "policy_kwargs='dict.n_atoms=5.' is Python code, and nothing is evaluated"),
+        ({"normalize": True}, "normalize must be false"),
+        ({"n_envs": 0}, "n_envs=0: it must be a whole number of at least 1"),
+        ({"env_wraper": "x"}, "no hyperparameter 'env_wraper': did you mean 'env_wrapper'"),
+        ({"policy_kwargs": {"n_atom": 5}}, "no argument 'n_atom': did you mean 'n_atoms'"),
+    ],
+)
+def test_entries_that_cannot_be_are_named(entry: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_entry("my.yml", entry)
+
+
+def test_what_only_rl_zoo3_can_do_is_an_error_elsewhere(tmp_path) -> None:
+    path = tmp_path / "noise.yml"
+    path.write_text(yaml.dump({"default": {"noise_type": "normal", "noise_std": 0.1}}))
+    with pytest.raises(ValueError, match="noise_type needs rl_zoo3: train with python -m"):
+        read_configuration(str(path), "MO-Ant-v4")
+
+
+def test_learning_rates_that_fall_linearly() -> None:
+    schedule = with_schedules({"learning_rate": "lin_3e-4"})["learning_rate"]
+    assert isinstance(schedule, LinearSchedule)
+    assert [schedule(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([3e-4, 1.5e-4, 0])
+    assert with_schedules({"learning_rate": 1e-3}) == {"learning_rate": 1e-3}
+    for bad in ("linear_3e-4", "lin_-1", "lin_nan"):
+        with pytest.raises(ValueError, match=f"learning_rate='{bad}': give a number of at least 0, or lin_3e-4"):
+            with_schedules({"learning_rate": bad})
