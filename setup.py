@@ -39,8 +39,9 @@ setup(
         "baselines": ["morl-baselines>=1.3"],
         "export": ["onnx>=1.16"],  # .onnx files; TorchScript needs nothing
         "hub": ["huggingface_hub>=0.30"],
+        "zoo": ["rl_zoo3>=2.9,<3", "seaborn>=0.13", "pandas>=2.2,<3"],  # the last two for its plots
         "test": [
-            "sb3-momba[baselines,export,hub]",
+            "sb3-momba[baselines,export,hub,zoo]",
             "onnxruntime>=1.18",
             "pymoo>=0.6",
             "rliable>=1.2",

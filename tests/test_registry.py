@@ -93,7 +93,7 @@ def test_an_id_is_made_once_and_only_where_it_helps() -> None:
 
 def test_importing_the_package_imports_no_task_and_not_rl_zoo3() -> None:
     code = """
-import sys, sb3_momba, sb3_momba.benchmark.__main__, sb3_momba.train
+import sys, sb3_momba, sb3_momba.benchmark.__main__, sb3_momba.train, sb3_momba.zoo.__main__
 wanted = ("rl_zoo3", "optuna", "mo_gymnasium.envs.mujoco.", "mo_gymnasium.envs.water_reservoir.dam_env")
 print([name for name in sys.modules if name.startswith(wanted)])
 """
