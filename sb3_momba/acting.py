@@ -15,12 +15,13 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
-from sb3_momba.checkpoints.training_state import set_states_of_callbacks
-from sb3_momba.diagnostics import forgive_full_disks
+from sb3_momba.checkpoints.training_state import given_callback, set_states_of_callbacks
+from sb3_momba.diagnostics import NegativeReturnWatch
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
 from sb3_momba.export import export_policy
 from sb3_momba.finite import all_finite
+from sb3_momba.logs import forgive_full_disks
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
 
@@ -33,6 +34,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     policy: MombaPolicy
     preference_sampler: PreferenceSampler | SamplerSpec | None
     deterministic_exploration: bool
+    _negative_returns: NegativeReturnWatch
     _root_callback: BaseCallback | None = None
     _states_of_callbacks: dict[str, Any] | None = None  # from a checkpoint, for the callbacks of the next `learn`
 
@@ -169,15 +171,16 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         resets = reset_num_timesteps or self._last_obs is None
         if resets:
             self.policy.return_scale.end_episodes()
+            self._negative_returns.end_episodes()
         if resets or not self.replay_buffer.goes_on:
             self.replay_buffer.end_episodes()
         self.replay_buffer.check_memory()
         total_timesteps, root = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        self._root_callback = root
+        self._root_callback = given_callback(root)
         forgive_full_disks(self.logger)
         if self._states_of_callbacks is not None:
             self.action_noise = noise_so_far
-            set_states_of_callbacks(root, self._states_of_callbacks)
+            set_states_of_callbacks(self._root_callback, self._states_of_callbacks)
             self._states_of_callbacks = None
         return total_timesteps, root
 

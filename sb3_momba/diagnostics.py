@@ -1,9 +1,7 @@
 """Metrics of the training: added up as tensors, turned into numbers only when the log is written."""
 
-import logging
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch as th
@@ -13,8 +11,6 @@ from torch import nn
 BLIND_UPDATES = 1_000
 
 Metrics = dict[str, th.Tensor]
-
-logger = logging.getLogger(__name__)
 
 
 class TrainingMetrics:
@@ -52,29 +48,6 @@ class TrainingMetrics:
         self.sums, self.count = {}, 0
 
 
-def forgive_full_disks(log: Logger) -> None:
-    """A log that cannot be written is said once, and does not end a training."""
-    for output in log.output_formats:
-        write = output.write
-        if not isinstance(write, ForgivingWrite):
-            output.write = ForgivingWrite(write)  # type: ignore[method-assign]
-
-
-class ForgivingWrite:
-    def __init__(self, write: Callable[..., None]):
-        self.write = write
-        self.warned = False
-
-    def __call__(self, *args: Any, **kwargs: Any) -> None:
-        try:
-            self.write(*args, **kwargs)
-        except OSError as error:
-            if not self.warned:
-                self.warned = True
-                owner = type(getattr(self.write, "__self__", None)).__name__
-                logger.warning("A log (%s) cannot be written: %s. The training goes on without it.", owner, error)
-
-
 class NegativeReturnWatch:
     """Warns once of the first episode whose undiscounted return is negative in an objective: eq. (3.21) assumes none."""
 
@@ -99,6 +72,11 @@ class NegativeReturnWatch:
                 stacklevel=2,
             )
         self.returns[ended] = 0
+
+    def end_episodes(self, indices: Sequence[int] | None = None) -> None:
+        """:param indices: the environments whose episodes end from outside; None: all"""
+        if self.returns is not None:
+            self.returns[slice(None) if indices is None else list(indices)] = 0
 
 
 def weight_norm(network: nn.Module) -> float:

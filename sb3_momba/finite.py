@@ -6,6 +6,5 @@ import numpy as np
 
 
 def all_finite(x: np.ndarray) -> bool:
-    """Whether nothing is NaN or infinite: so where the sum of squares is not. Where that overflows, numbers are looked at one
-    by one."""
+    """Whether nothing is NaN or infinite. A finite sum of squares proves it; where that overflows, each number is looked at."""
     return math.isfinite(np.vdot(x, x)) or bool(np.isfinite(x).all())

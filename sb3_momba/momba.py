@@ -82,7 +82,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     actor: Actor  # type: ignore[assignment]
     critic: Critic
     critic_target: Critic
-    _resumed_from: Checkpoint | None = None
+    _resumed_from: tuple[Checkpoint, PreferenceReplayBuffer] | None = None  # and the buffer that it filled
 
     def __init__(
         self,
@@ -294,13 +294,13 @@ class MOMBA(PreferenceConditionedAlgorithm):
         alpha = self.alpha
         with self._rounded_products():
             critic_loss, critic_metrics = self._critic_loss(batch, alpha)
-        descend(self.critic.optimizer, critic_loss)
+        descend(self.critic.optimizer, critic_loss, "critic")
         try:
             with self._rounded_products(), without_weight_gradients(self.critic):
                 actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
-            descend(self.actor.optimizer, actor_loss)
+            descend(self.actor.optimizer, actor_loss, "actor")
             if self.ent_coef_optimizer is not None:
-                descend(self.ent_coef_optimizer, self._alpha_loss(log_prob))
+                descend(self.ent_coef_optimizer, self._alpha_loss(log_prob), "entropy coefficient")
         finally:  # The critics have taken their step, even where the actor's is skipped.
             self.policy.project_weights()
             move_towards(self.critic_target, self.critic, self.tau)
@@ -417,10 +417,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
     @classmethod
     def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Self:
         """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)`
-        goes on exactly as if nothing had happened, callbacks of the same kinds in the same places included.
+        goes on exactly as if nothing had happened, callbacks of the same kinds in the same places included: SB3's own, and
+        others that have `state_dict` and `load_state_dict`.
 
         The same holds for the bits of every number on the same machine with the same versions and number of threads, for
-        environments whose only randomness is Gymnasium's `np_random`. For others it is said what was lost.
+        environments whose only randomness is Gymnasium's `np_random`. Where a running episode does not come out as it was, it
+        ends there, as truncated, with a warning.
 
         :param path: folder of a MombaCheckpointCallback, or one of the checkpoints in it; damaged ones are passed over
         :param env: an environment of the same kind, and as many

@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoard
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
+from sb3_momba.checkpoints.folders import checkpoints_in
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
 from sb3_momba.files import LOCK, alone_in
@@ -137,9 +138,9 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
 def run(settings: RunSettings) -> RunResult:
     """Train, evaluate and write the run's folder."""
     folder = Path(settings.output)
-    if folder.exists() and (not folder.is_dir() or any(file.name != LOCK for file in folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
+    _check_empty(folder)
     with prepared(settings) as ready, alone_in(folder):
+        _check_empty(folder)  # Another run may have come first.
         model, evaluation = ready.model, ready.evaluation
         assert evaluation.eval_env is not None
         sizes = {
@@ -154,6 +155,11 @@ def run(settings: RunSettings) -> RunResult:
             return _train(settings, ready, record, settings.steps)
 
 
+def _check_empty(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(file.name != LOCK for file in folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
+
+
 def resume(folder: Path, **running: Any) -> RunResult:
     """Go on with a run that was cut off, from its newest checkpoint.
 
@@ -166,6 +172,8 @@ def resume(folder: Path, **running: Any) -> RunResult:
     found = read_record(path)
     if found.error is None:
         raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
+    if not checkpoints_in(folder / CHECKPOINTS):
+        raise ValueError(f"{folder} holds a run that was cut off before its first checkpoint: delete it, and start it again.")
     settings = RunSettings(**{**found.config, **running, "output": str(folder)})
     with (
         alone_in(folder),

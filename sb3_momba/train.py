@@ -16,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
+from sb3_momba.envs.workers import WorkerError
 from sb3_momba.pareto import protocol
 from sb3_momba.records import plain
 from sb3_momba.runs import RunResult, RunSettings, resume, run
@@ -222,10 +223,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         given = parse_resume(arguments)
         running = {} if given is None else vars(given)
         result = run(parse(arguments)) if given is None else resume(running.pop("resume"), **running)
-    except (ValueError, MemoryError, ImportError, gym.error.Error) as error:
+    except (ValueError, MemoryError, ImportError, WorkerError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        print("\nInterrupted. The run's folder holds the model and a checkpoint: go on with --resume FOLDER.", file=sys.stderr)
+        print("\nInterrupted. If the training had begun, go on with --resume FOLDER.", file=sys.stderr)
         sys.exit(130)
     print(report(result))
 

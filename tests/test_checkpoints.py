@@ -12,6 +12,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, make_mo_vec_env
@@ -70,7 +71,7 @@ VARIANTS = {
     "noise that remembers, three environments": {
         **{"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5)), "n_envs": 3},
     },
-    "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": "linear"},
+    "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},
 }
 
 
@@ -79,10 +80,6 @@ VARIANTS = {
 def test_going_on_from_any_checkpoint_is_never_having_stopped(kwargs, tmp_path):
     kwargs = dict(kwargs)
     env, n_envs = kwargs.pop("env", "MO-Hopper-v4"), kwargs.pop("n_envs", 1)
-    if kwargs.get("learning_rate") == "linear":
-        from stable_baselines3.common.utils import LinearSchedule
-
-        kwargs["learning_rate"] = LinearSchedule(1e-3, 1e-5, 1.0)
     undisturbed = everything(new_model(make_mo_vec_env(env, n_envs), **kwargs).learn(240 * n_envs))
     observed = checkpointed(make_mo_vec_env(env, n_envs), tmp_path, 240 * n_envs, 53 * n_envs, **kwargs)
     assert_same_tree(everything(observed), undisturbed)
@@ -143,7 +140,60 @@ def test_an_environment_that_cannot_be_brought_back_is_named(tmp_path):
     model.learn(20, reset_num_timesteps=False)
 
 
+class OwnRewards(StubEnv):
+    """Draws its rewards from such a stream, and shows nothing of it."""
+
+    def step(self, action):
+        observation, reward, *others = super().step(action)
+        return observation, reward + np.random.default_rng().random(2), *others
+
+
+def test_rewards_that_differ_are_noticed_too(tmp_path):
+    checkpointed(OwnRewards(), tmp_path, 65, 100)
+    env = OwnRewards()
+    env.n_steps = 60
+    with pytest.warns(UserWarning, match=r"Environments \[0\] could not be brought back"):
+        MOMBA.resume(tmp_path, env)
+
+
 # ----------------------------------------------------------------------------------------------------------- callbacks
+
+
+@pytest.mark.parametrize("bars", [(False, True), (True, False)])
+def test_a_progress_bar_changes_nothing(bars, tmp_path):
+    def evaluation():
+        return ParetoEvalCallback(StubEnv, eval_freq=20, n_preferences=3, n_episodes=1)
+
+    before, after = bars
+    new_model(StubEnv()).learn(60, [evaluation(), MombaCheckpointCallback(30, tmp_path)], progress_bar=before)
+    folder, resumed = checkpoints_in(tmp_path)[1], evaluation()
+    model = MOMBA.resume(folder, stub_at(folder))
+    model.learn(model.remaining_timesteps, [resumed], reset_num_timesteps=False, progress_bar=after)
+    assert resumed.timesteps == [20, 40, 60]
+
+
+def test_a_callback_that_stops_the_training_leaves_no_half_step(tmp_path, caplog):
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.num_timesteps < 33
+
+    new_model(StubEnv()).learn(60, [Stop(), MombaCheckpointCallback(20, tmp_path)])
+    assert newest(tmp_path).steps == 20
+    assert "stopped the training in the middle of a step: the newest checkpoint is that at 20 steps" in caplog.text
+    assert gone_on(tmp_path, stub_at(checkpoints_in(tmp_path)[0])).num_timesteps == 60
+
+
+def test_a_callback_serves_one_training(tmp_path):
+    """The segments of another buffer are never mixed in."""
+    callback = MombaCheckpointCallback(20, tmp_path)
+    model = new_model(StubEnv()).learn(40, callback)
+    with pytest.raises(ValueError, match=r"holds checkpoints of another training, up to 40 steps"):
+        new_model(StubEnv()).learn(40, callback)
+    model.save_replay_buffer(tmp_path / "buffer")
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(35, callback, reset_num_timesteps=False)
+    resumed = MOMBA.resume(tmp_path, stub_at(checkpoints_in(tmp_path)[0]))
+    assert_same_tree(everything(resumed)["buffer"], everything(model)["buffer"])
 
 
 def test_callbacks_go_on_where_they_were(tmp_path):
@@ -264,6 +314,11 @@ def test_another_environment_is_refused(three_checkpoints):
         MOMBA.resume(three_checkpoints, StubEnv(n_objectives=3))
 
 
+def test_another_number_of_environments_is_refused(three_checkpoints):
+    with pytest.raises(FileFormatError, match="has 1 environments, not 2: give as many"):
+        MOMBA.resume(three_checkpoints, make_mo_vec_env(StubEnv, 2))
+
+
 def test_settings_that_cannot_be_are_refused(tmp_path):
     with pytest.raises(ValueError, match="save_freq=0"):
         MombaCheckpointCallback(0, tmp_path)
@@ -298,6 +353,54 @@ def test_a_signal_writes_a_checkpoint_and_ends_the_training(number, tmp_path):
     checkpoint = newest(tmp_path)
     assert checkpoint.steps == 57
     assert MOMBA.resume(tmp_path, stub_at(checkpoint.folder)).num_timesteps == 57
+
+
+IN_PROCESSES = """
+import os, signal, sys
+from sb3_momba import MombaCheckpointCallback, make_mo_vec_env
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import SubprocVecEnv
+from tests.stubs import StubEnv
+from tests.test_checkpoints import new_model
+
+class CtrlC(BaseCallback):
+    def _on_step(self):
+        if self.num_timesteps == 58:
+            os.killpg(os.getpgid(0), signal.SIGINT)
+        return True
+
+if __name__ == "__main__":
+    env = make_mo_vec_env(StubEnv, 2, vec_env_cls=SubprocVecEnv)
+    new_model(env).learn(100_000, [CtrlC(), MombaCheckpointCallback(50_000, sys.argv[1])])
+"""
+
+
+def test_ctrl_c_at_a_terminal_reaches_the_environments_too_and_costs_nothing(tmp_path):
+    (tmp_path / "script.py").write_text(IN_PROCESSES)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]),
+    }
+    command = [sys.executable, tmp_path / "script.py", tmp_path / "checkpoints"]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, start_new_session=True)
+    assert ended.returncode == -signal.SIGINT, ended.stderr
+    assert newest(tmp_path / "checkpoints").steps == 58
+
+
+def test_a_signal_at_the_very_end_is_not_lost(tmp_path):
+    class AtTheEnd(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_training_end(self):
+            signal.raise_signal(signal.SIGINT)
+
+    callback = MombaCheckpointCallback(20, tmp_path)
+    model = new_model(StubEnv())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(30, [AtTheEnd(), callback])
+    assert newest(tmp_path).steps == 30
+    assert model.learn(5, callback, reset_num_timesteps=False).num_timesteps == 35
 
 
 def test_handlers_are_the_users_again_after_an_error(tmp_path):

@@ -1,23 +1,27 @@
 """Checkpoints while training."""
 
 import contextlib
+import logging
 import os
 import signal
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_momba.checkpoints.checkpoint import write_checkpoint
-from sb3_momba.checkpoints.folders import CheckpointWriter
+from sb3_momba.checkpoints.folders import CheckpointWriter, steps_of_newest
 from sb3_momba.files import alone_in
 
 if TYPE_CHECKING:
+    from sb3_momba.buffers import PreferenceReplayBuffer
     from sb3_momba.momba import MOMBA
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+logger = logging.getLogger(__name__)
 
 
 class MombaCheckpointCallback(BaseCallback):
@@ -43,20 +47,33 @@ class MombaCheckpointCallback(BaseCallback):
         self.save_freq = int(save_freq)
         self.path = Path(path)
         self.writer = CheckpointWriter(path, keep)
+        self.buffer: PreferenceReplayBuffer | None = None  # whose rows the writer's segments hold
+        self.is_between_rollouts = True
         self.received: int | None = None
         self.lock = contextlib.ExitStack()
         self.handlers: dict[int, Any] = {}
 
     def _init_callback(self) -> None:
-        resumed_from = self.model._resumed_from
-        if resumed_from is not None and resumed_from.folder.parent.resolve() == self.path.resolve():
-            self.writer.go_on_from(resumed_from)
+        if self.buffer is not self.model.replay_buffer:
+            self._begin(self.model.replay_buffer)
         self.saved_at = self.model.num_timesteps
         self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
 
+    def _begin(self, buffer: "PreferenceReplayBuffer") -> None:
+        """Go on with the segments of the checkpoint that this training was resumed from, or with none."""
+        self.buffer = buffer
+        self.writer.checksums = {}
+        checkpoint, resumed_buffer = self.model._resumed_from or (None, None)
+        if checkpoint is not None and buffer is resumed_buffer and checkpoint.folder.parent.resolve() == self.path.resolve():
+            self.writer.go_on_from(checkpoint)
+        elif (found := steps_of_newest(self.path)) > self.model.num_timesteps:
+            raise ValueError(
+                f"{self.path} holds checkpoints of another training, up to {found:,} steps, which new ones would displace: go "
+                "on with MOMBA.resume, or choose another folder."
+            )
+
     def _on_training_start(self) -> None:
         self.lock.enter_context(alone_in(self.path))
-        self.root: BaseCallback = self.locals["callback"]
         if threading.current_thread() is threading.main_thread():
             self.handlers = {number: signal.signal(number, self._note) for number in SIGNALS}
 
@@ -69,31 +86,46 @@ class MombaCheckpointCallback(BaseCallback):
             signal.signal(*self.handlers.popitem())
 
     def _on_rollout_start(self) -> None:
+        self.is_between_rollouts = True
         # Only here have the last transition and the updates that follow it been made.
         if self.model.num_timesteps >= self.next_save or self.received is not None:
             self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
             self.save()
         if self.received is not None:
-            number, self.received = self.received, None
-            if number == signal.SIGINT:
-                raise KeyboardInterrupt
-            raise SystemExit(128 + number)
+            self._end()
+
+    def _end(self) -> NoReturn:
+        number, self.received = self.received, None
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + (number or 0))
 
     def _on_step(self) -> bool:
+        self.is_between_rollouts = False
         return True
+
+    def _on_rollout_end(self) -> None:
+        self.is_between_rollouts = True
 
     def after_learn(self) -> None:
         """However `learn` has ended."""
         self._restore_handlers()
         self.lock.close()
+        if self.received is not None:
+            self._end()
 
     def _on_training_end(self) -> None:
-        if self.saved_at < self.model.num_timesteps:
+        if self.saved_at < self.model.num_timesteps and self.is_between_rollouts:
             self.save()
+        elif not self.is_between_rollouts:
+            logger.warning(
+                "A callback has stopped the training in the middle of a step: the newest checkpoint is that at %d steps.",
+                self.saved_at,
+            )
 
     def save(self) -> None:
         """Write a checkpoint now."""
-        write_checkpoint(self.model, self.writer, self.root)
+        write_checkpoint(self.model, self.writer)
         self.saved_at = self.model.num_timesteps
         if self.verbose >= 1:
             print(f"Checkpoint at {self.saved_at:,} steps in {self.path}")

@@ -3,7 +3,6 @@
 import os
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_momba.checkpoints import environments
@@ -26,11 +25,8 @@ MODEL, STATE = "model.zip", "state.zip"
 Model = TypeVar("Model", bound="MOMBA")
 
 
-def write_checkpoint(model: "MOMBA", writer: CheckpointWriter, callback: BaseCallback | None) -> None:
-    """Between two rollouts, when the last transition is stored and its updates are made.
-
-    :param callback: the root of the training's callbacks
-    """
+def write_checkpoint(model: "MOMBA", writer: CheckpointWriter) -> None:
+    """Between two rollouts, when the last transition is stored and its updates are made."""
     assert model.env is not None
     segments, buffer = write_segments(model.replay_buffer, writer)
     state = {
@@ -38,7 +34,7 @@ def write_checkpoint(model: "MOMBA", writer: CheckpointWriter, callback: BaseCal
         "buffer": buffer,
         "environments": environments.states_of(model.env),
         "statistics": statistics_of(model),
-        "callbacks": states_of_callbacks(callback),
+        "callbacks": states_of_callbacks(model._root_callback),
     }
     writer.write(model.num_timesteps, {MODEL: model.tree(), STATE: state}, segments)
 
@@ -52,19 +48,25 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
     model = cls.load(checkpoint.folder / MODEL, env, force_reset=False, **kwargs)
     state, _ = read_tree(checkpoint.folder / STATE)
     with content_of(checkpoint.folder):
+        episodes = state["environments"]
+        if episodes is not None and len(episodes) != model.n_envs:
+            raise FileFormatError(f"{checkpoint.folder} has {len(episodes)} environments, not {model.n_envs}: give as many.")
+        environments.check(episodes)
         read_segments(model.replay_buffer, checkpoint, state["buffer"])
         set_statistics(model, state["statistics"])
-        _bring_back_environments(model, state["environments"])
+    _bring_back_environments(model, episodes)
+    with content_of(checkpoint.folder):
         set_random_states(model, state["random"])
-        model._states_of_callbacks = state["callbacks"]
-    model._resumed_from = checkpoint
+        model._states_of_callbacks = dict(state["callbacks"])
+    model._resumed_from = checkpoint, model.replay_buffer
     return model
 
 
-def _bring_back_environments(model: "MOMBA", states: list[dict[str, Any]] | None) -> None:
+def _bring_back_environments(model: "MOMBA", episodes: list[dict[str, Any]] | None) -> None:
     assert model.env is not None
     assert model._last_obs is not None
-    model._last_obs, lost = environments.bring_back(model.env, states, model._last_obs)  # type: ignore[arg-type]
+    model._last_obs, lost = environments.bring_back(model.env, episodes, model._last_obs)  # type: ignore[arg-type]
     if lost:
         model.replay_buffer.end_episodes(lost)
         model.policy.return_scale.end_episodes(lost)
+        model._negative_returns.end_episodes(lost)

@@ -9,9 +9,10 @@ import warnings
 from typing import Any
 
 import numpy as np
+from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Philox
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_momba.envs.wrappers import PreferenceWrapper
+from sb3_momba.envs.wrappers import LONGEST_REPLAY, PreferenceWrapper
 
 
 def states_of(env: VecEnv) -> list[dict[str, Any]] | None:
@@ -19,6 +20,33 @@ def states_of(env: VecEnv) -> list[dict[str, Any]] | None:
     if not all(env.env_is_wrapped(PreferenceWrapper)):
         return None
     return list(env.env_method("episode_so_far"))
+
+
+def check(states: Any) -> None:
+    """What a file holds in the place of `states_of`.
+
+    :raises TypeError: if it cannot be that
+    """
+    if states is None:
+        return
+    for state in states:
+        for name in ("rng", "rng_now", "env_rng"):
+            if name != "env_rng" or state[name] is not None:
+                check_generator(state[name])
+        if not (state["seed"] is None or type(state["seed"]) is int) or not isinstance(state["options"], dict | None):
+            raise TypeError("an environment's reset has another seed or other options")
+        numbers = [state[name] for name in ("actions", "preference", "vector_return") if state[name] is not None]
+        if not all(isinstance(array, np.ndarray) and array.dtype.kind in "fiu" for array in numbers):
+            raise TypeError("an environment's actions, preference or return are no numbers")
+
+
+def check_generator(state: Any) -> None:
+    """:raises TypeError: if it is no state of NumPy's random numbers"""
+    kinds = {kind.__name__: kind for kind in (PCG64, PCG64DXSM, MT19937, Philox, SFC64)}
+    try:
+        kinds[state["bit_generator"]]().state = state
+    except (ValueError, OverflowError) as error:
+        raise TypeError(f"no state of random numbers: {error}") from error
 
 
 def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: np.ndarray) -> tuple[np.ndarray, list[int]]:
@@ -34,7 +62,7 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
     for index in range(env.num_envs):
         if states is not None:
             reached = _replay(env, index, states[index])
-            if reached is not None and np.array_equal(reached, observations[index]):
+            if reached is not None and all(map(np.array_equal, reached, (observations[index], states[index]["vector_return"]))):
                 continue
         lost.append(index)
         observations[index] = env.env_method("reset", indices=[index])[0][0]
@@ -45,15 +73,16 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
             + (
                 "They are not in a PreferenceWrapper."
                 if states is None
-                else "They have randomness outside np_random, or state that a reset does not set."
+                else "They have randomness outside np_random, state that a reset does not set, or an episode of more than "
+                f"{LONGEST_REPLAY:,} steps."
             ),
             stacklevel=3,
         )
     return observations, lost
 
 
-def _replay(env: VecEnv, index: int, state: dict[str, Any]) -> np.ndarray | None:
-    """[s, w] at the end of the episode so far; None where it ended earlier or was too long to be noted."""
+def _replay(env: VecEnv, index: int, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+    """[s, w] at the end of the episode so far, and its vector return; None where it ended earlier or was not noted."""
     if state["actions"] is None:
         return None
     (seed_and_options,) = env.env_method("begin_replay", state, indices=[index])
@@ -63,4 +92,4 @@ def _replay(env: VecEnv, index: int, state: dict[str, Any]) -> np.ndarray | None
         if terminated or truncated:
             return None
     (reached,) = env.env_method("end_replay", state, indices=[index])
-    return np.asarray(reached)
+    return reached[0], reached[1]

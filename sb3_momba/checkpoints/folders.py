@@ -57,6 +57,12 @@ def checkpoints_in(root: Path) -> list[Path]:
     return sorted(found, key=number_of, reverse=True)
 
 
+def steps_of_newest(root: Path) -> int:
+    """Of a folder's newest checkpoint, whole or damaged; -1 where there is none."""
+    folders = checkpoints_in(root)
+    return int(folders[0].name.partition("-")[2]) if folders else -1
+
+
 def newest(path: str | os.PathLike[str]) -> Checkpoint:
     """The newest checkpoint of a folder that is whole, or the one that is given itself.
 
@@ -103,7 +109,7 @@ def read_manifest(folder: Path) -> Checkpoint:
     try:
         whole = json.loads(file.read_bytes(), parse_constant=refuse_constant)
         content, stated = whole["content"], whole["sha256"]
-        found = hashlib.sha256(canonical(content)).hexdigest()
+        found = digest_of(content)
         checkpoint = Checkpoint(folder, *(content[name] for name in ("steps", "files", "shared")))
         is_ours = content["format"] == FORMAT and content["version"] == VERSION
         if not all(set(one) == {"bytes", "sha256"} for one in checkpoint.files.values()):
@@ -167,9 +173,8 @@ class CheckpointWriter:
             files = {file: described(aside / file) for file in trees}
             files.update({f"../{SHARED}/{file}": self.checksums[file] for file in shared})
             content = {"format": FORMAT, "version": VERSION, "steps": steps, "files": files, "shared": shared}
-            whole = {"content": content, "sha256": hashlib.sha256(canonical(content)).hexdigest()}
             with open(aside / MANIFEST, "w") as manifest:
-                json.dump(whole, manifest, allow_nan=False, indent=1)
+                manifest.write(sealed(content))
                 manifest.flush()
                 os.fsync(manifest.fileno())
             if shared:
@@ -226,8 +231,13 @@ def checksum(file: Path) -> str:
     return digest.hexdigest()
 
 
-def canonical(content: Any) -> bytes:
-    return json.dumps(content, allow_nan=False, sort_keys=True).encode()
+def sealed(content: dict[str, Any]) -> str:
+    """A manifest's text: its content with its own checksum."""
+    return json.dumps({"content": content, "sha256": digest_of(content)}, allow_nan=False, indent=1)
+
+
+def digest_of(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, allow_nan=False, sort_keys=True).encode()).hexdigest()
 
 
 def sync_folder(folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 
 # What SB3's own callbacks count and remember; others have `state_dict` and `load_state_dict`.
 REMEMBERED = (
@@ -21,6 +21,7 @@ REMEMBERED = (
     "evaluations_results",
     "evaluations_timesteps",
     "evaluations_length",
+    "evaluations_successes",
 )
 
 
@@ -56,9 +57,20 @@ def statistics_of(model: Any) -> dict[str, Any]:
 
 def set_statistics(model: Any, statistics: dict[str, Any]) -> None:
     model.policy.return_scale.running_returns = statistics["running_returns"]
-    vars(model._metrics).update(statistics["metrics"])
+    metrics = statistics["metrics"]
+    metrics["sums"] = {name: total.to(model.device) for name, total in metrics["sums"].items()}
+    if isinstance(metrics["blind_updates"], th.Tensor):
+        metrics["blind_updates"] = metrics["blind_updates"].to(model.device)
+    vars(model._metrics).update(metrics)
     vars(model._negative_returns).update(statistics["negative_returns"])
     model._skipped_updates = statistics["skipped_updates"]
+
+
+def given_callback(root: BaseCallback) -> BaseCallback:
+    """What `learn` was given, without the list in which SB3 puts a progress bar beside it."""
+    if isinstance(root, CallbackList) and len(root.callbacks) == 2 and isinstance(root.callbacks[1], ProgressBarCallback):
+        return root.callbacks[0]
+    return root
 
 
 def callbacks_below(callback: BaseCallback | None, place: str = "") -> Iterator[tuple[str, BaseCallback]]:
@@ -67,7 +79,7 @@ def callbacks_below(callback: BaseCallback | None, place: str = "") -> Iterator[
         return
     place = f"{place}/{type(callback).__name__}"
     yield place, callback
-    for name in ("callbacks", "callback", "callback_on_new_best", "callback_after_eval"):
+    for name in ("callbacks", "callback", "callback_on_new_best"):
         below = getattr(callback, name, None)
         for index, one in enumerate(below if isinstance(below, list) else [below]):
             if isinstance(one, BaseCallback):
@@ -84,7 +96,7 @@ def _state_of(callback: BaseCallback) -> dict[str, Any]:
 
 
 def set_states_of_callbacks(root: BaseCallback | None, states: dict[str, Any]) -> None:
-    """Callbacks that were there before go on where they were; a new one begins anew, which is said."""
+    """Callbacks that were there before go on where they were. It is said where one is missing that had a state of its own."""
     places = dict(callbacks_below(root))
     for place, state in states.items():
         callback = places.get(place)

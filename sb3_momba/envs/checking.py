@@ -39,7 +39,15 @@ def check_mo_env(env: EnvLike, n_steps: int = 1_000, seed: int = 0, env_kwargs: 
     :param n_steps: how long, over as many episodes as that takes
     :raises ValueError: naming what is wrong, and the cure
     """
-    env = make_env(env, env_kwargs)
+    made = make_env(env, env_kwargs)
+    try:
+        _check(made, n_steps, seed)
+    finally:
+        if made is not env:
+            made.close()
+
+
+def _check(env: gym.Env, n_steps: int, seed: int) -> None:
     if is_wrapped(env, PreferenceWrapper):
         raise ValueError("This environment is in PreferenceWrapper already: check the one inside, which has the vector reward.")
     _check_interface(env.unwrapped, seed)
@@ -61,7 +69,7 @@ def check_mo_env(env: EnvLike, n_steps: int = 1_000, seed: int = 0, env_kwargs: 
     if errors:
         raise ValueError("\n- ".join([f"{type(env.unwrapped).__name__} is not ready for a training:", *errors]))
     for advice in _advice(env, rollout):
-        warnings.warn(advice, stacklevel=2)
+        warnings.warn(advice, stacklevel=3)
 
 
 def _check_interface(env: gym.Env, seed: int) -> None:

@@ -1,6 +1,8 @@
 """Environments in processes of their own that say why they do not answer."""
 
 import multiprocessing
+import signal
+import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,6 +56,20 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.remotes[0].send(("get_spaces", None))
         VecEnv.__init__(self, len(env_fns), *self.remotes[0].recv())
 
+    def close(self) -> None:
+        if self.closed:
+            return
+        if self.waiting:
+            for remote in self.remotes:
+                remote.recv()
+        for remote in self.remotes:
+            remote.send(("close", None))
+        deadline = time.monotonic() + self.timeout
+        for process in self.processes:
+            process.join(max(deadline - time.monotonic(), 0))
+            process.kill()  # one that hangs
+        self.closed = True
+
     def fail(self, index: int, what: str, its_traceback: str = "") -> NoReturn:
         """End all processes and say what happened to one."""
         code = self.processes[index].exitcode
@@ -97,6 +113,7 @@ class Remote:
 
 
 def _watched_worker(theirs: Connection, ours: Connection, env_fn: CloudpickleWrapper) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the training decides when it ends.
     try:
         _worker(theirs, ours, env_fn)
     except Exception:

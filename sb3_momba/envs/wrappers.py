@@ -69,7 +69,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._holds_for_episode = False
         self._rng = np.random.default_rng()
         self._episode_step = 0
-        self._episode: dict[str, Any] = {"actions": None}
+        self._episode: dict[str, Any] = {"actions": None, "vector_return": np.zeros(self.n_objectives)}
 
         box = env.observation_space
         assert isinstance(box, spaces.Box)
@@ -117,6 +117,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             "env_rng": None if seed is not None else self.np_random.bit_generator.state,
             "rng": self._rng.bit_generator.state,
             "actions": [],
+            "vector_return": np.zeros(self.n_objectives),
         }
         # As SB3 does it: an environment whose reset takes no options still works where none are given.
         observation, info = self.env.reset(seed=seed, **({"options": options} if options else {}))
@@ -131,6 +132,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         assert self._preference is not None, "call reset() before step()"
         self._episode_step += 1
         vector_reward = self._check_reward(reward)
+        self._episode["vector_return"] += vector_reward
         w = self._preference
         # As long as the environment uses the same dict again, ours must be another one.
         info = {**info, "vector_reward": vector_reward, "preference": w.copy()}
@@ -148,10 +150,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
                 self._episode["actions"] = None
 
     def episode_so_far(self) -> dict[str, Any]:
-        """What is needed to play the running episode again: the random numbers at its reset, the actions since, and the
-        preferences of this moment. `actions` is None where there is no episode, or too long a one."""
+        """What is needed to play the running episode again: the random numbers at its reset, the actions since, (n,
+        action_dim), what they earned, and the preferences of this moment. `actions` is None where there is no episode, or too
+        long a one."""
+        actions = self._episode["actions"]
         return {
             **self._episode,
+            "actions": None if actions is None else np.array(actions),
             "episode_step": self._episode_step,
             "preference": self._preference,
             "fixed_preference": self._fixed_preference,
@@ -166,12 +171,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._rng.bit_generator.state = state["rng"]
         return {"seed": state["seed"], "options": state["options"]}
 
-    def end_replay(self, state: dict[str, Any]) -> np.ndarray:
-        """Set the preferences to those of the moment when `state` was noted; [observation, w] of that moment."""
+    def end_replay(self, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Set the preferences to those of the moment when `state` was noted; [observation, w] of that moment, and what was
+        earned until then."""
         self._fixed_preference, self._preference = state["fixed_preference"], state["preference"]
         self._holds_for_episode = state["holds_for_episode"]
         self._rng.bit_generator.state = state["rng_now"]
-        return self._observe(self._observation)
+        return self._observe(self._observation), self._episode["vector_return"]
 
     def _next_preference(self) -> np.ndarray:
         if self._fixed_preference is not None:

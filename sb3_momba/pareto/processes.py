@@ -1,6 +1,7 @@
 """Work that several processes share, where one that dies or hangs ends it all with an error."""
 
 import faulthandler
+import signal
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -26,7 +27,12 @@ def in_processes(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]],
         runs = [CloudpickleWrapper((function, call, f"{folder}/{index}", timeout)) for index, call in enumerate(calls)]
         try:
             with ProcessPoolExecutor(len(runs), mp_context=_context()) as pool:
-                return list(pool.map(_run, runs))
+                try:
+                    return list(pool.map(_run, runs))
+                except BaseException:
+                    for process in (pool._processes or {}).values():  # The pool itself would wait for those that still run.
+                        process.kill()
+                    raise
         except BrokenProcessPool as error:
             places = [path.read_text() for path in Path(folder).iterdir()]
             hung = [place for place in places if place]
@@ -44,6 +50,7 @@ def _context() -> BaseContext:
 
 
 def _run(run: CloudpickleWrapper) -> Any:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the caller decides when this ends.
     function, call, path, timeout = run.var
     with open(path, "w") as file:
         watch = Watch(file, timeout)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_momba import MOMBA, MombaCheckpointCallback, make_mo_vec_env
+from sb3_momba import MOMBA, MombaCheckpointCallback, SimbaPolicy, make_mo_vec_env
 from sb3_momba.checkpoints.folders import MANIFEST, checkpoints_in, newest
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.records import RecordWriter, read_record
@@ -37,9 +37,10 @@ def kinds_of_files(folder: Path) -> list[Kind]:
     """An example of each, and how it is loaded."""
     model = new_model().learn(30, MombaCheckpointCallback(SAVE_FREQ, folder / "checkpoints", keep=1))
     (checkpoint,) = checkpoints_in(folder / "checkpoints")
-    for name in ("model", "buffer", "record", "front", "configuration"):
+    for name in ("model", "policy", "buffer", "record", "front", "configuration"):
         (folder / name).mkdir()
     model.save(folder / "model" / "model.zip")
+    model.policy.save(folder / "policy" / "policy.zip")
     model.save_replay_buffer(folder / "buffer" / "buffer.npz")
     write_record(folder / "record" / "record.jsonl")
     a_front().save(folder / "front" / "front.npz")
@@ -59,6 +60,7 @@ def kinds_of_files(folder: Path) -> list[Kind]:
 
     return [
         single("model", "model.zip", partial(MOMBA.load, device="cpu"), "zip"),
+        single("policy", "policy.zip", partial(SimbaPolicy.load, device="cpu"), "zip"),
         single("buffer", "buffer.npz", model.load_replay_buffer, "zip"),
         of_checkpoint(MANIFEST, "json"),
         of_checkpoint("model.zip", "zip"),
