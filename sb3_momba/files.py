@@ -226,7 +226,7 @@ class _Encoder:
             return {"~": "class", "name": qualified_name(x)}
         raise TypeError(
             f"{place.lstrip('.')} is a {type(x).__name__}, which cannot be stored without pickle: remove it, or leave it out "
-            "with exclude=[...]."
+            "of a saved model with exclude=[...]."
         )
 
     def _encode_whole(self, state: Any, place: str) -> Any:

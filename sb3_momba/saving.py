@@ -237,7 +237,7 @@ def read_model(path: FilePath) -> dict[str, Any]:
     path = with_existing_suffix(path, ".zip")
     if pickled_by_sb3(path):
         raise FileFormatError(
-            f"{path} was pickled by Stable-Baselines3: loading it can execute anything. If you made it yourself, "
+            f"{path} was pickled by Stable-Baselines3: loading it can execute anything. If it is a MOMBA of your own, "
             "MOMBA.load(..., trust=True) reads it."
         )
     tree = read_format(path, MODEL_FORMAT)

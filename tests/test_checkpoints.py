@@ -7,13 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, make_mo_vec_env
 from sb3_momba.buffers import STORED_ARRAYS
@@ -156,6 +158,16 @@ def test_rewards_that_differ_are_noticed_too(tmp_path):
         MOMBA.resume(tmp_path, env)
 
 
+def test_frames_that_are_stacked_begin_anew(tmp_path):
+    def make():
+        return VecFrameStack(DummyVecEnv([lambda: Monitor(gym.make("Pendulum-v1"))]), 3)
+
+    checkpointed(make(), tmp_path, 65, 100)
+    with pytest.warns(UserWarning, match="could not be brought back.*VecFrameStack around them"):
+        model = MOMBA.resume(tmp_path, make())
+    assert model.learn(20, reset_num_timesteps=False).num_timesteps == 85
+
+
 # ----------------------------------------------------------------------------------------------------------- callbacks
 
 
@@ -251,6 +263,45 @@ def test_segments_are_written_once(tmp_path):
     assert {name: after[name] for name in before} == before
 
 
+def test_a_segment_that_is_gone_is_written_again(tmp_path):
+    class Delete(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 45:
+                min((tmp_path / "shared").iterdir()).unlink()
+            return True
+
+    model = new_model(StubEnv()).learn(60, [Delete(), MombaCheckpointCallback(20, tmp_path)])
+    resumed = MOMBA.resume(checkpoints_in(tmp_path)[0], stub_at(checkpoints_in(tmp_path)[0]))
+    assert_same_tree(everything(resumed), everything(model))
+
+
+def test_files_of_others_are_left_alone(tmp_path):
+    (tmp_path / "shared" / "folder").mkdir(parents=True)
+    (tmp_path / "shared" / "thesis.npz").touch()
+    new_model(StubEnv()).learn(60, MombaCheckpointCallback(20, tmp_path, keep=1))
+    assert {"folder", "thesis.npz"} < {file.name for file in (tmp_path / "shared").iterdir()}
+
+
+def test_the_folder_stays_where_it_was(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    callback = MombaCheckpointCallback(20, "checkpoints")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    new_model(StubEnv()).learn(30, callback)
+    assert newest(tmp_path / "checkpoints").steps == 30
+
+
+def test_a_training_that_diverges_keeps_its_last_good_checkpoints(tmp_path, monkeypatch, caplog):
+    model = new_model(StubEnv()).learn(40, MombaCheckpointCallback(20, tmp_path))
+    critic_loss = model._critic_loss
+    monkeypatch.setattr(model, "_critic_loss", lambda *args: (critic_loss(*args)[0] * np.nan, {}))
+    with pytest.raises(ArithmeticError, match="20 updates in a row"):
+        model.learn(40, MombaCheckpointCallback(5, tmp_path, keep=1), reset_num_timesteps=False)
+    assert newest(tmp_path).steps == 40
+    assert "the critic's loss is nan" in caplog.text
+    assert "No checkpoint at 45 steps: updates are being skipped" in caplog.text
+
+
 # -------------------------------------------------------------------------------------------------------------- damage
 
 
@@ -320,6 +371,8 @@ def test_another_number_of_environments_is_refused(three_checkpoints):
 
 
 def test_settings_that_cannot_be_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"env=None: resuming .* needs the training's environment"):
+        MOMBA.resume(tmp_path, None)
     with pytest.raises(ValueError, match="save_freq=0"):
         MombaCheckpointCallback(0, tmp_path)
     with pytest.raises(ValueError, match="keep=0"):

@@ -45,8 +45,8 @@ class MombaCheckpointCallback(BaseCallback):
         if keep < 1:
             raise ValueError(f"keep={keep}: at least one checkpoint must stay.")
         self.save_freq = int(save_freq)
-        self.path = Path(path)
-        self.writer = CheckpointWriter(path, keep)
+        self.path = Path(path).resolve()
+        self.writer = CheckpointWriter(self.path, keep)
         self.buffer: PreferenceReplayBuffer | None = None  # whose rows the writer's segments hold
         self.is_between_rollouts = True
         self.received: int | None = None
@@ -64,7 +64,7 @@ class MombaCheckpointCallback(BaseCallback):
         self.buffer = buffer
         self.writer.checksums = {}
         checkpoint, resumed_buffer = self.model._resumed_from or (None, None)
-        if checkpoint is not None and buffer is resumed_buffer and checkpoint.folder.parent.resolve() == self.path.resolve():
+        if checkpoint is not None and buffer is resumed_buffer and checkpoint.folder.parent.resolve() == self.path:
             self.writer.go_on_from(checkpoint)
         elif (found := steps_of_newest(self.path)) > self.model.num_timesteps:
             raise ValueError(
@@ -124,7 +124,10 @@ class MombaCheckpointCallback(BaseCallback):
             )
 
     def save(self) -> None:
-        """Write a checkpoint now."""
+        """Write a checkpoint now; not while updates are skipped, so that a training that diverges leaves its last good ones."""
+        if self.model._skipped_updates > 0:
+            logger.warning("No checkpoint at %d steps: updates are being skipped.", self.model.num_timesteps)
+            return
         write_checkpoint(self.model, self.writer)
         self.saved_at = self.model.num_timesteps
         if self.verbose >= 1:

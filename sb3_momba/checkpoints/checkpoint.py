@@ -41,6 +41,8 @@ def write_checkpoint(model: "MOMBA", writer: CheckpointWriter) -> None:
 
 def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Model:
     """See `MOMBA.resume`."""
+    if env is None:
+        raise ValueError(f"env=None: resuming {path} needs the training's environment.")
     checkpoint = newest(path)
     missing = [file for file in (MODEL, STATE) if file not in checkpoint.files]
     if missing:

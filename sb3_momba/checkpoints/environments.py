@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Philox
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_momba.envs.wrappers import LONGEST_REPLAY, PreferenceWrapper
 
@@ -58,6 +58,9 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
     """
     env._reset_seeds()
     env._reset_options()
+    if isinstance(env, VecEnvWrapper):
+        _warn(list(range(env.num_envs)), f"{type(env).__name__} around them has a state of its own.")
+        return np.asarray(env.reset()), list(range(env.num_envs))
     observations, lost = observations.copy(), []
     for index in range(env.num_envs):
         if states is not None:
@@ -66,19 +69,23 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
                 continue
         lost.append(index)
         observations[index] = env.env_method("reset", indices=[index])[0][0]
-    if lost:
-        warnings.warn(
-            f"Environments {lost} could not be brought back to where they were: their episodes end here, as truncated, and "
-            "what follows differs from an undisturbed run. "
-            + (
-                "They are not in a PreferenceWrapper."
-                if states is None
-                else "They have randomness outside np_random, state that a reset does not set, or an episode of more than "
-                f"{LONGEST_REPLAY:,} steps."
-            ),
-            stacklevel=3,
+    if lost and states is None:
+        _warn(lost, "They are not in a PreferenceWrapper.")
+    elif lost:
+        _warn(
+            lost,
+            "They have randomness outside np_random, state that a reset does not set, or an episode of more than "
+            f"{LONGEST_REPLAY:,} steps.",
         )
     return observations, lost
+
+
+def _warn(lost: list[int], why: str) -> None:
+    warnings.warn(
+        f"Environments {lost} could not be brought back to where they were: their episodes end here, as truncated, and what "
+        f"follows differs from an undisturbed run. {why}",
+        stacklevel=5,
+    )
 
 
 def _replay(env: VecEnv, index: int, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:

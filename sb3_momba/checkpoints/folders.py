@@ -25,6 +25,8 @@ VERSION = 1
 MANIFEST = "manifest.json"
 SHARED = "shared"
 NAME = re.compile(r"(\d{4,})-\d{9,}")
+# Rows first to end - 1 of a replay buffer, counted since the training began; and a word that no other segment has.
+SHARED_NAME = re.compile(r"(\d{12})-(\d{12})-[0-9a-f]{8}\.npz")
 CHECKSUM_BLOCK = 2**20
 HIDDEN = "."  # what a folder's name begins with while it is written or deleted
 
@@ -83,7 +85,10 @@ def newest(path: str | os.PathLike[str]) -> Checkpoint:
         except (FileFormatError, OSError) as error:
             logger.warning("A checkpoint is passed over: %s", error)
             last = error
-    raise FileFormatError(f"None of the {len(folders)} checkpoints in {path} is whole; the oldest: {last}") from last
+    raise FileFormatError(
+        f"None of the {len(folders)} checkpoints in {path} is whole; the oldest: {last} A model.zip in them that is whole can "
+        "still be loaded by MOMBA.load, without the replay buffer."
+    ) from last
 
 
 def verified(folder: Path) -> Checkpoint:
@@ -147,6 +152,11 @@ class CheckpointWriter:
         """Let the next checkpoint use the shared files of this one."""
         self.checksums = {name: checkpoint.files[f"../{SHARED}/{name}"] for name in checkpoint.shared}
 
+    def lacks(self, name: str) -> bool:
+        """Whether a shared file is gone, or not as long as it was."""
+        file = self.shared_folder / name
+        return not file.is_file() or file.stat().st_size != self.checksums[name]["bytes"]
+
     def write_shared(self, name: str, tree: Any) -> None:
         """A file that this checkpoint and later ones use."""
         self.shared_folder.mkdir(parents=True, exist_ok=True)
@@ -199,7 +209,7 @@ class CheckpointWriter:
                 shutil.rmtree(folder, ignore_errors=True)
         used = {name for folder in folders[: self.keep] for name in shared_of(folder)}
         for file in self.shared_folder.glob("*") if self.shared_folder.is_dir() else ():
-            if file.name not in used:
+            if file.name not in used and SHARED_NAME.fullmatch(file.name):
                 file.unlink(missing_ok=True)
         self.checksums = {name: stated for name, stated in self.checksums.items() if name in used}
 

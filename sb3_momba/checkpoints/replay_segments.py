@@ -1,17 +1,13 @@
 """A replay buffer in immutable segments: a checkpoint writes only the transitions that are new."""
 
-import re
 import secrets
 from typing import Any
 
 import numpy as np
 
 from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
-from sb3_momba.checkpoints.folders import SHARED, Checkpoint, CheckpointWriter
+from sb3_momba.checkpoints.folders import SHARED, SHARED_NAME, Checkpoint, CheckpointWriter
 from sb3_momba.files import FileFormatError, read_tree
-
-# Rows first to end - 1, counted since the training began; and a word that no other segment has.
-NAME = re.compile(r"(\d{12})-(\d{12})-[0-9a-f]{8}\.npz")
 
 
 def segment_name(first: int, end: int) -> str:
@@ -23,14 +19,14 @@ def rows_of(name: str) -> tuple[int, int]:
 
     :raises FileFormatError: if it is none
     """
-    match = NAME.fullmatch(name)
+    match = SHARED_NAME.fullmatch(name)
     if match is None:
         raise FileFormatError(f"{name!r} is no segment of a replay buffer.")
     return int(match[1]), int(match[2])
 
 
 def write_segments(buffer: PreferenceReplayBuffer, writer: CheckpointWriter) -> tuple[list[str], dict[str, Any]]:
-    """Write what no segment holds yet.
+    """Write what no segment holds yet; all of it where one of them is gone.
 
     The newest row is no part of them: it still changes where its episode is ended from outside.
 
@@ -38,6 +34,8 @@ def write_segments(buffer: PreferenceReplayBuffer, writer: CheckpointWriter) -> 
     """
     oldest, last = buffer.n_added - buffer.size(), max(buffer.n_added - 1, 0)
     names = [name for name in writer.checksums if rows_of(name)[1] > oldest]
+    if any(map(writer.lacks, names)):
+        names = []
     first = max(rows_of(names[-1])[1] if names else 0, oldest)
     if first < last:
         names.append(segment_name(first, last))
