@@ -29,7 +29,8 @@ from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text
 from sb3_momba.files import FileFormatError, alone_in
 from sb3_momba.pareto.metrics import convex_envelope, non_dominated
-from sb3_momba.records import UNENDED, Record, RecordWriter, read_record
+from sb3_momba.records import UNENDED, Record, RecordWriter, plain, read_record
+from sb3_momba.zoo.configuration import with_defaults
 from tests.stubs import TINY_SIMBA
 
 ENV = "mo-hopper-2obj-v5"
@@ -187,6 +188,16 @@ def test_runs_of_one_method_may_differ_in_what_is_no_part_of_it(fake, settings: 
 def test_one_number_written_in_two_ways_is_one_setting(fake) -> None:
     one, other = (fake(FRONT, settings=hyperparameters(gamma=gamma)) for gamma in (1, 1.0))
     assert list(only(compare([one, other])).methods) == ["a"]
+
+
+def test_settings_that_came_after_a_record_have_their_defaults(fake) -> None:
+    older = hyperparameters(gamma=0.99)
+    now = plain(with_defaults("MlpPolicy", older["hyperparameters"]))
+    made = [fake(FRONT, settings={"policy": "MlpPolicy", **settings}) for settings in (older, {"hyperparameters": now})]
+    assert list(only(compare(made)).methods) == ["a"]
+    now["policy_kwargs"]["activation_fn"] = "torch.nn.modules.activation.Tanh"
+    made.append(fake(FRONT, settings={"policy": "MlpPolicy", "hyperparameters": now}))
+    assert [name.partition("=")[0] for name in only(compare(made)).methods] == ["a (activation_fn"] * 2
 
 
 # -------------------------------------------------------------------------------------------------------------- scores

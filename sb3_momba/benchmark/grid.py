@@ -21,7 +21,7 @@ from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_
 from sb3_momba.runs import CHECKPOINTS, RunSettings, prepared, record_failure, recorded_settings
 from sb3_momba.settings import parse_ent_coef
 from sb3_momba.train import parse
-from sb3_momba.zoo.configuration import read_configuration
+from sb3_momba.zoo.configuration import read_configuration, with_later_settings
 
 logger = logging.getLogger(__name__)
 
@@ -109,8 +109,9 @@ def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) 
             raise ValueError(f"{folder} holds something else than a run: choose another --output.")
         return True
     found, wanted = read_record(record), recorded_settings(settings)
-    if found.config != wanted:
-        theirs, ours = flat(found.config), flat(wanted)
+    config = with_later_settings(found.config)
+    if config != wanted:
+        theirs, ours = flat(config), flat(wanted)
         differing = sorted(name for name in {*theirs, *ours} if theirs.get(name) != ours.get(name))
         raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
     return found.error == UNENDED or (retry_failed and found.error is not None)

@@ -17,6 +17,7 @@ from sb3_momba.pareto.metrics import (
     preference_regret,
 )
 from sb3_momba.records import Record
+from sb3_momba.zoo.configuration import with_later_settings
 
 Array = NDArray[np.float64]
 
@@ -179,7 +180,8 @@ def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
         by_label[record.label].append(record)
     methods: dict[str, list[Record]] = defaultdict(list)
     for label in sorted(by_label):
-        settings = [flat({k: v for k, v in r.config.items() if k not in NOT_THE_METHOD}) for r in by_label[label]]
+        configs = [with_later_settings(record.config) for record in by_label[label]]
+        settings = [flat({k: v for k, v in config.items() if k not in NOT_THE_METHOD}) for config in configs]
         names = sorted({name for one in settings for name in one})
         differing = [name for name in names if len({repr(one.get(name)) for one in settings}) > 1]
         for record, one in zip(by_label[label], settings, strict=True):

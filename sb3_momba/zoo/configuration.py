@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_momba.envs.registry import PREFIX, raw_id
 from sb3_momba.momba import MOMBA
 from sb3_momba.policies import MombaPolicy
+from sb3_momba.records import plain
 from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parameters, policy_parameters
 
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
@@ -173,6 +174,13 @@ def with_defaults(policy: str, hyperparameters: dict[str, Any]) -> dict[str, Any
             **(hyperparameters.get("policy_kwargs") or {}),
         },
     }
+
+
+def with_later_settings(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's recorded settings; arguments of MOMBA that came after it have their defaults, which change nothing."""
+    if config.get("policy") not in POLICIES or "hyperparameters" not in config:
+        return config
+    return {**config, "hyperparameters": plain(with_defaults(config["policy"], config["hyperparameters"]))}
 
 
 def defaults(cls: type, but: Container[str] = ()) -> dict[str, Any]:
