@@ -167,12 +167,16 @@ def read_tree(path: FilePath) -> tuple[Any, list[str]]:
 
 @contextlib.contextmanager
 def content_of(path: FilePath) -> Iterator[None]:
-    """Inside, a file's content is used: what it does not fit is an error that names the file.
+    """Inside, a file's content is used: what does not fit is an error that names the file.
 
     :raises FileFormatError: in place of errors that content of a wrong type or shape leads to
     """
     try:
         yield
+    except FileFormatError:
+        raise
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     except WRONG_CONTENT as error:
         raise FileFormatError(f"{path} does not hold what it should: {type(error).__name__}: {error}") from error
 

@@ -60,7 +60,7 @@ def test_a_policy_of_sac_that_momba_has_not_is_refused_with_those_that_it_has():
         MOMBA("CnnPolicy", StubEnv())
 
 
-@pytest.mark.parametrize("activation_fn", ["tanh", th.tanh, th.optim.Adam], ids=str)
+@pytest.mark.parametrize("activation_fn", ["tanh", th.tanh, th.optim.Adam], ids=["a name", "a function", "another class"])
 def test_an_activation_is_a_class_of_torch(activation_fn):
     with pytest.raises(ValueError, match=r"activation_fn=.*such as torch\.nn\.Tanh"):
         tiny_model(StubEnv(), "MlpPolicy", policy_kwargs={"activation_fn": activation_fn})

@@ -115,7 +115,7 @@ def test_shipped_configurations_and_parameters_from_the_command_line(folder: Pat
 def test_unknown_names_are_errors(folder: Path) -> None:
     code, said = zoo(folder, f"train --env {TASK} --conf tiny.yml -params btach_size:3")
     assert code == 1
-    assert said.splitlines()[-1] == "error: MOMBA has no hyperparameter 'btach_size': did you mean 'batch_size'?"
+    assert said.splitlines()[-1] == "error: tiny.yml: MOMBA has no hyperparameter 'btach_size': did you mean 'batch_size'?"
     assert "Traceback" not in said
 
 

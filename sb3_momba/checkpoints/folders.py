@@ -145,8 +145,11 @@ class CheckpointWriter:
     def __init__(self, root: str | os.PathLike[str], keep: int = 3):
         self.root = Path(root)
         self.keep = keep
-        self.shared_folder = self.root / SHARED
         self.checksums: dict[str, dict[str, Any]] = {}  # of the shared files, in the order in which they were written
+
+    @property
+    def shared_folder(self) -> Path:
+        return self.root / SHARED
 
     def go_on_from(self, checkpoint: Checkpoint) -> None:
         """Let the next checkpoint use the shared files of this one."""

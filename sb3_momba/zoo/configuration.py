@@ -69,7 +69,7 @@ def find_entry(name: str, env_id: str) -> tuple[str, dict[str, Any]]:
     """
     try:
         entries = yaml.safe_load(find_file(name).read_text())
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {said}") from error
     for key in (env_id, raw_id(env_id), PREFIX + raw_id(env_id), "default"):
@@ -114,7 +114,10 @@ def check_entry(name: str, entry: dict[str, Any]) -> dict[str, Any]:
                 entry[key] = int(entry[key])
             check_whole(f"{name}: {key}", entry[key], 1)
     own = {key: value for key, value in entry.items() if key not in (*RUN_KEYS, *ZOO_KEYS)}
-    check_hyperparameters(entry["policy"], own)
+    try:
+        check_hyperparameters(entry["policy"], own)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     return entry
 
 

@@ -1,6 +1,5 @@
 """Checkpoints of a small training, against the same training without any interruption."""
 
-import os
 from pathlib import Path
 
 from sb3_momba import MombaCheckpointCallback
@@ -45,11 +44,15 @@ def before_a_checkpoint(folder: Path) -> tuple[MombaCheckpointCallback, dict[int
     """A training with two checkpoints in a folder, and ten steps after the second; the next one removes the first of them
     and files that only it has used.
 
-    :return: a callback that writes into "checkpoints", from wherever the process is, and the fingerprints of both moments
+    :return: the callback that wrote them, and the fingerprints of both moments
     """
-    os.chdir(folder)
     model, fingerprints = new_model(), Fingerprints(SAVE_FREQ)
-    callback = MombaCheckpointCallback(SAVE_FREQ, "checkpoints", keep=2)
+    callback = MombaCheckpointCallback(SAVE_FREQ, folder / "checkpoints", keep=2)
     model.learn(80, [fingerprints, callback])
     model.learn(SAVE_FREQ, fingerprints, reset_num_timesteps=False)
     return callback, fingerprints.found
+
+
+def write_into(callback: MombaCheckpointCallback, folder: Path) -> None:
+    """Let a callback go on in a copy of the folder that it was made for."""
+    callback.path = callback.writer.root = folder / "checkpoints"

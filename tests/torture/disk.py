@@ -14,7 +14,7 @@ from stable_baselines3 import SAC
 
 from sb3_momba import MOMBA, MombaCheckpointCallback
 from sb3_momba.checkpoints.folders import checkpoints_in
-from tests.torture.checkpoints import before_a_checkpoint, faults_of
+from tests.torture.checkpoints import before_a_checkpoint, faults_of, write_into
 from tests.torture.measured import Counts, Measured
 from tests.torture.processes import new_folder, result_of
 from tests.torture.trainings import new_model, new_sac
@@ -39,7 +39,7 @@ def error_of(write: Callable[[], Any], limit: int) -> str:
 
 def error_of_checkpoint(callback: MombaCheckpointCallback, folder: Path, limit: int) -> tuple[str, str]:
     """Of a checkpoint's write, and of the same again when there is room."""
-    os.chdir(folder)
+    write_into(callback, folder)
     return error_of(callback.save, limit), error_of(callback.save, resource.RLIM_INFINITY)
 
 
@@ -122,7 +122,7 @@ def checkpoints_on_a_full_disk(n_limits: int) -> tuple[list[Any], list[str]]:
             with new_folder() as copy:
                 shutil.copytree(folder, copy, dirs_exist_ok=True)
                 before = files_in(copy)
-                os.chdir(copy)
+                write_into(callback, copy)
                 error = result_of(error_of, callback.save, limit)
                 steps, faults = result_of(faults_of, copy / "checkpoints", undisturbed)
                 # A segment that was written whole may stay: the next checkpoint removes it.
@@ -134,7 +134,6 @@ def checkpoints_on_a_full_disk(n_limits: int) -> tuple[list[Any], list[str]]:
                 broken.append(f"checkpoint, at most {limit} bytes: error {error!r}, {faults}, nothing left: {is_clean}")
             if again or later != steps_after or later_faults:
                 broken.append(f"checkpoint, at most {limit} bytes, and then without limit: {again} {later_faults}")
-        os.chdir("/")
     return ["checkpoint", len(found), *(sum(column) for column in zip(*found, strict=True))], broken
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_momba import MombaCheckpointCallback
-from tests.torture.checkpoints import before_a_checkpoint, faults_of
+from tests.torture.checkpoints import before_a_checkpoint, faults_of, write_into
 from tests.torture.measured import Counts, Measured, Rows, totals
 from tests.torture.processes import die, new_folder, result_of, started, was_killed
 
@@ -80,7 +80,8 @@ class WatchedFile(io.FileIO):
         return super().write(data)
 
 
-def operations_of_one_write(callback: MombaCheckpointCallback) -> list[str]:
+def operations_of_one_write(callback: MombaCheckpointCallback, folder: Path) -> list[str]:
+    write_into(callback, folder)
     operations = Operations()
     operations.watch()
     callback.save()
@@ -88,7 +89,7 @@ def operations_of_one_write(callback: MombaCheckpointCallback) -> list[str]:
 
 
 def write_and_die(callback: MombaCheckpointCallback, folder: Path, number: int, after: bool) -> None:
-    os.chdir(folder)
+    write_into(callback, folder)
     Operations(number, after).watch()
     callback.save()
 
@@ -98,8 +99,7 @@ def operations(counts: Counts) -> Measured:
     with new_folder() as folder, new_folder() as rehearsal:
         callback, undisturbed = before_a_checkpoint(folder)
         shutil.copytree(folder, rehearsal, dirs_exist_ok=True)
-        os.chdir(rehearsal)
-        names = result_of(operations_of_one_write, callback)
+        names = result_of(operations_of_one_write, callback, rehearsal)
         old, new = sorted(undisturbed)[-2:]
         found: dict[str, Counter[str]] = {name: Counter() for name in names}
         broken = []
@@ -118,7 +118,6 @@ def operations(counts: Counts) -> Measured:
                 found[name][outcome] += 1
                 when = "after" if after else "before"
                 broken += [f"killed {when} operation {number}, {name}: {fault}" for fault in faults]
-        os.chdir("/")
     rows: Rows = [
         ["operation", "in one checkpoint", "kills", "the old checkpoint is the newest", "the new one is", "none or mixed"]
     ]
