@@ -6,7 +6,6 @@ Shapes: `values` is (n_solutions, n_objectives), `preferences` is (n_preferences
 import moocore
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linprog
 
 Array = NDArray[np.float64]
 
@@ -102,6 +101,8 @@ def _largest_lead(leads: Array) -> float:
     n, n_objectives = leads.shape
     if n == 0:
         return np.inf
+    from scipy.optimize import linprog  # It takes a fifth of a second to import.
+
     found = linprog(
         c=[*[0.0] * n_objectives, -1.0],
         A_ub=np.hstack([-leads, np.ones((n, 1))]),

@@ -2,15 +2,18 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.metrics import as_points, non_dominated
+
+if TYPE_CHECKING:  # It takes half a second to import, and few processes draw.
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe & Ito (2008): told apart by the colour-blind.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -24,7 +27,7 @@ def plot_front(
     path: str | os.PathLike[str] | None = None,
     objectives: Sequence[str] | None = None,
     title: str | None = None,
-) -> Figure:
+) -> "Figure":
     """Draw solution sets of two or three objectives; dominated solutions are faint.
 
     :param fronts: a ParetoFront, its values (n, n_objectives), or several of them under the names of the legend
@@ -43,6 +46,8 @@ def plot_front(
         raise ValueError(f"objectives={labels}: {n_objectives} labels are needed.")
 
     # A Figure of its own, not pyplot's: nothing is kept alive, and no display is needed.
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(6, 4.5), layout="constrained")
     axes = figure.add_subplot(projection="3d" if n_objectives == 3 else None)
     for i, (name, p) in enumerate(points.items()):
@@ -67,7 +72,7 @@ def verbatim(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _scatter(axes: Axes, points: np.ndarray, label: str, colour: str, marker: str) -> None:
+def _scatter(axes: "Axes", points: np.ndarray, label: str, colour: str, marker: str) -> None:
     on_front = non_dominated(points)
     axes.scatter(*points[~on_front].T, color=colour, marker=marker, s=14, alpha=0.25)  # type: ignore[misc]
     front = points[on_front]
