@@ -3,6 +3,7 @@
 import os
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_momba.checkpoints import environments
@@ -53,7 +54,10 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
         episodes = state["environments"]
         if episodes is not None and len(episodes) != model.n_envs:
             raise FileFormatError(f"{checkpoint.folder} has {len(episodes)} environments, not {model.n_envs}: give as many.")
-        environments.check(episodes)
+        environments.check(episodes, model.n_objectives, model.action_space)
+        last: Any = model._last_obs
+        if np.shape(last) != (model.n_envs, *(model.observation_space.shape or ())):
+            raise FileFormatError(f"{checkpoint.folder / MODEL} has last observations of shape {np.shape(last)}.")
         read_segments(model.replay_buffer, checkpoint, state["buffer"])
         set_statistics(model, state["statistics"])
     _bring_back_environments(model, episodes)

@@ -9,6 +9,7 @@ import warnings
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Philox
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
@@ -22,10 +23,10 @@ def states_of(env: VecEnv) -> list[dict[str, Any]] | None:
     return list(env.env_method("episode_so_far"))
 
 
-def check(states: Any) -> None:
+def check(states: Any, n_objectives: int, action_space: spaces.Space[Any]) -> None:
     """What a file holds in the place of `states_of`.
 
-    :raises TypeError: if it cannot be that
+    :raises TypeError: if it cannot be that, and other errors that content of a wrong type leads to
     """
     if states is None:
         return
@@ -35,9 +36,12 @@ def check(states: Any) -> None:
                 check_generator(state[name])
         if not (state["seed"] is None or type(state["seed"]) is int) or not isinstance(state["options"], dict | None):
             raise TypeError("an environment's reset has another seed or other options")
-        numbers = [state[name] for name in ("actions", "preference", "vector_return") if state[name] is not None]
-        if not all(isinstance(array, np.ndarray) and array.dtype.kind in "fiu" for array in numbers):
-            raise TypeError("an environment's actions, preference or return are no numbers")
+        shapes: dict[str, tuple[int, ...]] = {"preference": (n_objectives,), "vector_return": (n_objectives,)}
+        if state["actions"] is not None and len(state["actions"]) > 0:
+            shapes["actions"] = (len(state["actions"]), *(action_space.shape or ()))
+        for name, shape in shapes.items():
+            if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind not in "fiu":
+                raise TypeError(f"an environment's {name} are no numbers of shape {shape}")
 
 
 def check_generator(state: Any) -> None:

@@ -119,8 +119,8 @@ def read_manifest(folder: Path) -> Checkpoint:
         is_ours = content["format"] == FORMAT and content["version"] == VERSION
         if not all(set(one) == {"bytes", "sha256"} for one in checkpoint.files.values()):
             raise TypeError("an entry of its files has no length and checksum")
-        if not all(isinstance(name, str) for name in checkpoint.shared):
-            raise TypeError("a shared file's name is no text")
+        if not all(f"../{SHARED}/{name}" in checkpoint.files for name in checkpoint.shared):
+            raise TypeError("a shared file has no length and checksum")
     except FileNotFoundError as error:
         raise FileFormatError(f"{file} is missing.") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

@@ -67,9 +67,10 @@ def find_entry(name: str, env_id: str) -> tuple[str, dict[str, Any]]:
     :param name: path of a yaml file, or name of a shipped one, such as "capql"
     :raises ValueError: for a file that is no yaml, or has no entry
     """
+    file = find_file(name)
     try:
-        entries = yaml.safe_load(find_file(name).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        entries = yaml.safe_load(file.read_text())
+    except (yaml.YAMLError, ValueError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {said}") from error
     for key in (env_id, raw_id(env_id), PREFIX + raw_id(env_id), "default"):
