@@ -313,7 +313,7 @@ def three_checkpoints(tmp_path) -> Path:
 
 @pytest.mark.parametrize("file", ["manifest.json", "model.zip", "state.zip"])
 @pytest.mark.parametrize("damage", ["a flipped bit", "truncated", "deleted"])
-def test_a_damaged_checkpoint_is_passed_over_and_named(file, damage, three_checkpoints, caplog):
+def test_row_34_a_damaged_checkpoint_is_passed_over_and_named(file, damage, three_checkpoints, caplog):
     latest, before = checkpoints_in(three_checkpoints)[:2]
     break_file(latest / file, damage)
     assert newest(three_checkpoints).folder == before
@@ -360,7 +360,7 @@ def test_another_format_is_named(three_checkpoints):
         newest(folder)
 
 
-def test_another_environment_is_refused(three_checkpoints):
+def test_row_37_another_environment_is_refused(three_checkpoints):
     with pytest.raises(ValueError, match="The model was trained with n_objectives=2"):
         MOMBA.resume(three_checkpoints, StubEnv(n_objectives=3))
 
@@ -399,7 +399,7 @@ new_model(StubEnv()).learn(100_000, [Signal(), MombaCheckpointCallback(50_000, s
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_writes_a_checkpoint_and_ends_the_training(number, tmp_path):
+def test_row_33_a_signal_writes_a_checkpoint_and_ends_the_training(number, tmp_path):
     command = [sys.executable, "-c", SIGNALLED, str(tmp_path), str(int(number))]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert ended.returncode == (143 if number == signal.SIGTERM else -signal.SIGINT), ended.stderr
@@ -469,7 +469,7 @@ def test_handlers_are_the_users_again_after_an_error(tmp_path):
     assert os.listdir(tmp_path) == [".lock"]
 
 
-def test_two_trainings_in_one_folder_are_refused(tmp_path):
+def test_row_39_two_trainings_in_one_folder_are_refused(tmp_path):
     with alone_in(tmp_path), pytest.raises(ValueError, match="Another process writes into"):
         new_model(StubEnv()).learn(5, MombaCheckpointCallback(100, tmp_path))
     new_model(StubEnv()).learn(5, MombaCheckpointCallback(100, tmp_path))
