@@ -1,9 +1,9 @@
 """Trained models on the Hugging Face Hub, with a model card: pushing, and loading from there.
 
 A repository holds model.zip (`MOMBA.load` reads it and executes nothing), front.npz (`ParetoFront.load`), for two or three
-objectives front.png, for a run its record.jsonl, and the card. huggingface_sb3's `load_from_hub` fetches them as ours does, where
-TRUST_REMOTE_CODE is set for SB3's pickled files. Its `package_to_hub` cannot make them: it unzips those files, and knows scalar
-rewards only.
+objectives front.png, for a run its record.jsonl, and the card. huggingface_sb3's `load_from_hub` fetches them as ours does,
+where TRUST_REMOTE_CODE is set for SB3's pickled files. Its `package_to_hub` cannot make them: it unzips those files, and knows
+scalar rewards only.
 """
 
 import os
