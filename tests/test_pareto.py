@@ -752,6 +752,16 @@ def test_a_model_of_other_objectives_is_an_error():
         evaluate_front(tiny_model(SeededEnv(3)), SeededEnv, 2, 1)
 
 
+def test_a_model_of_other_observations_or_actions_is_refused_before_anything_runs():
+    model = tiny_model(StubEnv())
+    with pytest.raises(
+        ValueError, match=r"The model's observation_space has shape \(5,\), that of mo-hopper-2obj-v5 has \(13,\)"
+    ):
+        ParetoEvalCallback("mo-hopper-2obj-v5", eval_freq=10).check(model)
+    with pytest.raises(ValueError, match=r"The model's action_space has shape \(2,\), that of StubEnv has \(3,\)"):
+        evaluate_front(model, lambda: StubEnv(action_dim=3), n_preferences=3)
+
+
 # ------------------------------------------------------------------------------------------------- ParetoFront's file
 
 

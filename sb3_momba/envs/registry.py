@@ -25,6 +25,7 @@ CONTINUOUS = (
     *("mo-lunar-lander-continuous-v3", "mo-mountaincarcontinuous-v0", "mo-swimmer-v4", "mo-swimmer-v5"),
     *("mo-walker2d-v4", "mo-walker2d-v5", "water-reservoir-v0"),
 )
+_raw_ids: dict[str, str] = {}
 NEEDED_ARGUMENTS = {"water-reservoir-v0": {"normalized_action": True}}  # Its actions have no bounds otherwise.
 
 
@@ -40,6 +41,7 @@ def preference_id(env_id: str) -> str:
     if any(wrapper.name == WRAPPER.name for wrapper in spec.additional_wrappers):
         return env_id
     wrapped_id = PREFIX + env_id.replace("/", ".")  # An id has one namespace.
+    _raw_ids[wrapped_id] = env_id
     if wrapped_id not in gym.registry:
         gym.register(
             wrapped_id,
@@ -57,7 +59,7 @@ def preference_id(env_id: str) -> str:
 
 def raw_id(env_id: str) -> str:
     """The task's own id: "momba/mo-hopper-2obj-v5" -> "mo-hopper-2obj-v5"; any other id as it is."""
-    return env_id.removeprefix(PREFIX)
+    return _raw_ids.get(env_id, env_id.removeprefix(PREFIX))
 
 
 def copies_of(venv: VecEnv) -> Callable[[], gym.Env]:

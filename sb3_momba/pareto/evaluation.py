@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.preferences import check_preference, preference_grid
+from sb3_momba.envs.registry import raw_id
 from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.files import FileFormatError, FilePath, read_tree, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.pareto import metrics
@@ -274,7 +275,8 @@ class Probe:
     name: str
     n_objectives: int
     deterministic: bool
-    action_space: Any  # a Box; wrap_env refuses others
+    observation_space: Any  # Boxes; wrap_env refuses others
+    action_space: Any
 
 
 def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_kwargs: dict[str, Any] | None = None) -> Probe:
@@ -287,12 +289,14 @@ def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_k
             raise ValueError("VecNormalize scales rewards, which are no returns then: give the environment without it.")
         spec = env.get_attr("spec", indices=[0])[0]
         deterministic = env.has_attr("deterministic") and all(env.get_attr("deterministic"))
-        return Probe(spec.id if spec is not None else "VecEnv", n_objectives_of(env), bool(deterministic), env.action_space)
+        name = raw_id(spec.id) if spec is not None else "VecEnv"
+        return Probe(name, n_objectives_of(env), bool(deterministic), env.observation_space, env.action_space)
     one = wrap_env(make_env(env, env_kwargs))
     try:
-        name = one.spec.id if one.spec is not None else type(one.unwrapped).__name__
+        name = raw_id(one.spec.id) if one.spec is not None else type(one.unwrapped).__name__
         deterministic = one.has_wrapper_attr("deterministic") and one.get_wrapper_attr("deterministic")
-        return Probe(name, one.get_wrapper_attr("n_objectives"), bool(deterministic), one.action_space)
+        n_objectives = one.get_wrapper_attr("n_objectives")
+        return Probe(name, n_objectives, bool(deterministic), one.observation_space, one.action_space)
     finally:
         if one.unwrapped is not getattr(env, "unwrapped", None):
             one.close()
@@ -301,11 +305,15 @@ def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_k
 def check_model_fits(model: Any, probe: Probe) -> int:
     """The number of objectives.
 
-    :raises ValueError: if a model that knows its own has another one
+    :raises ValueError: if a model that knows its own has another one, or other observations or actions
     """
     n_objectives = getattr(model, "n_objectives", probe.n_objectives)
     if n_objectives != probe.n_objectives:
         raise ValueError(f"The model has {n_objectives} objectives, the environment {probe.name} has {probe.n_objectives}.")
+    for name in ("observation_space", "action_space"):
+        ours, theirs = getattr(model, name, None), getattr(probe, name)
+        if ours is not None and ours.shape != theirs.shape:
+            raise ValueError(f"The model's {name} has shape {ours.shape}, that of {probe.name} has {theirs.shape}.")
     return probe.n_objectives
 
 
