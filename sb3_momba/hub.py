@@ -72,7 +72,8 @@ def push_to_hub(
         package(source, folder, repo_id, front, reference_point=reference_point, objectives=objectives, env_kwargs=env_kwargs)
         api = HfApi(token=token, library_name="sb3_momba", library_version=__version__)
         address = api.create_repo(repo_id, private=private, exist_ok=True)
-        api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=commit_message)
+        ours = [MODEL_NAME, FRONT_NAME, PICTURE_NAME, RECORD_NAME]  # of an earlier push
+        api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=commit_message, delete_patterns=ours)
     return str(address)
 
 

@@ -229,7 +229,13 @@ def test_pushing_makes_the_repository_and_uploads_the_package(run_folder, offlin
     assert client["token"] == "secret"
     assert calls == [
         ("create_repo", {"repo_id": REPO, "private": True, "exist_ok": True}),
-        ("upload_folder", {"repo_id": REPO, "commit_message": "mine", "files": sorted([*WHOLE, "record.jsonl"])}),
+        (
+            "upload_folder",
+            {
+                **{"repo_id": REPO, "commit_message": "mine", "files": sorted([*WHOLE, "record.jsonl"])},
+                "delete_patterns": ["model.zip", "front.npz", "front.png", "record.jsonl"],
+            },
+        ),
     ]
 
 
