@@ -139,10 +139,10 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
 
 def whole_number(text: str) -> int:
     """An integer that may be written 1e6."""
-    try:
-        return int(float(text))
-    except OverflowError as error:
-        raise ValueError(f"{text} is no whole number") from error
+    number = float(text)
+    if not number.is_integer():
+        raise ValueError(f"{text} is no whole number")
+    return int(number)
 
 
 def first_given(*values: int | None) -> int:

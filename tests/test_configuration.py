@@ -1,11 +1,14 @@
 """Yaml files in rl_zoo3's format, read without rl_zoo3."""
 
+import gymnasium as gym
 import pytest
 import yaml
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_momba.envs.registry import preference_id
 from sb3_momba.train import parse
-from sb3_momba.zoo.configuration import check_entry, find_entry, read_configuration, with_schedules
+from sb3_momba.zoo.configuration import check_entry, find_entry, literal, read_configuration, with_schedules
+from tests.stubs import StubEnv
 
 TASK = "mo-hopper-2obj-v5"
 
@@ -56,3 +59,35 @@ def test_learning_rates_that_fall_linearly() -> None:
     for bad in ("linear_3e-4", "lin_-1", "lin_nan"):
         with pytest.raises(ValueError, match=f"learning_rate='{bad}': give a number of at least 0, or lin_3e-4"):
             with_schedules({"learning_rate": bad})
+
+
+def test_only_numbers_with_an_exponent_are_read_from_strings() -> None:
+    """yaml 1.1 takes 1e-3 for a string; what is quoted is one."""
+    read = literal({"a": "1e-3", "b": "1E6", "c": "007", "d": "nan", "e": ["2.5e+2", "x"], "f": "3"})
+    assert read == {"a": 1e-3, "b": 1_000_000, "c": "007", "d": "nan", "e": [250, "x"], "f": "3"}
+
+
+@pytest.mark.parametrize("rate", ["3e4", "lin_inf", "lin_nan", "lin_-1", "linear", "lin_"])
+def test_learning_rates_that_cannot_be_are_named(rate: str) -> None:
+    with pytest.raises(ValueError, match=f"learning_rate='{rate}': give a number of at least 0, or lin_3e-4"):
+        with_schedules({"learning_rate": rate})
+
+
+def test_an_entry_of_an_id_with_a_namespace_is_found_under_both(tmp_path) -> None:
+    gym.register("mine/Stub-v0", StubEnv)
+    try:
+        path = tmp_path / "two.yml"
+        path.write_text(yaml.dump({"mine/Stub-v0": {"gamma": 0.9}, "default": {"gamma": 0.7}}))
+        assert preference_id("mine/Stub-v0") == "momba/mine.Stub-v0"
+        found = [find_entry(str(path), name)[1]["gamma"] for name in ("mine/Stub-v0", "momba/mine.Stub-v0")]
+        assert found == [0.9, 0.9]
+    finally:
+        for name in ("mine/Stub-v0", "momba/mine.Stub-v0"):
+            gym.registry.pop(name, None)
+
+
+@pytest.mark.parametrize("steps", ["1.9", "nan", "inf"])
+def test_steps_are_whole(steps: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        parse(["--env", TASK, "--steps", steps])
+    assert f"'{steps}'" in capsys.readouterr().err

@@ -12,7 +12,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_momba.envs.registry import preference_id
+from sb3_momba.envs.registry import PREFIX, preference_id
+from sb3_momba.envs.workers import WorkerError
 from sb3_momba.zoo.configuration import find_file
 
 PROGRAM = "python -m sb3_momba.zoo"
@@ -82,12 +83,6 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")
 
 
-def conf_file(name: str) -> str:
-    """The yaml file of a path or of a shipped configuration; a Python module's name, which rl_zoo3 reads too, as it is."""
-    is_module = "." in name and "/" not in name and not name.endswith((".yml", ".yaml", ".py"))
-    return name if is_module else str(find_file(name))
-
-
 def train(command: str, arguments: Sequence[str]) -> None:
     """rl_zoo3's train, with momba.yml as the default file and shipped configurations by name."""
     parser = new_parser(command)
@@ -100,7 +95,7 @@ def train(command: str, arguments: Sequence[str]) -> None:
     manager.register()
     if given.algo == manager.NAME:
         script.ExperimentManager = manager.MombaExperimentManager
-        options += ["--conf-file", conf_file(given.conf or manager.NAME)]
+        options += ["--conf-file", str(find_file(given.conf or manager.NAME))]
     elif given.conf is not None:
         options += ["--conf-file", given.conf]
     call(script.train, command, [*options, "-optimize"] if command == "optimize" else options)
@@ -117,6 +112,8 @@ def enjoy(command: str, arguments: Sequence[str]) -> None:
     script = import_rl_zoo3("rl_zoo3.enjoy")
     manager = import_rl_zoo3("sb3_momba.zoo.manager")
     manager.register()
+    if given.algo != manager.NAME and given.preference is not None:
+        raise ValueError(f"--preference is for --algo {manager.NAME}: of {given.algo} it would change nothing. Leave it out.")
     if given.algo == manager.NAME:
         playing = importlib.import_module("sb3_momba.zoo.playing")
         own = importlib.import_module("rl_zoo3.utils").create_test_env
@@ -137,7 +134,8 @@ def plot(command: str, arguments: Sequence[str]) -> None:
     if name != "plot_from_file" and not wants_help(options):
         if given.env is None:
             raise ValueError(NO_ENV)
-        names_of_folders = [env.replace("/", "-") for env in given.env]
+        # rl_zoo3 looks for them in its folders' names, where a momba/ id has one dash and a raw one its own dots.
+        names_of_folders = [env.replace("/", "-" if env.startswith(PREFIX) else ".") for env in given.env]
         options += ["-a", *given.algo, "-f", *given.exp_folder, "-e", *names_of_folders]
     pyplot = importlib.import_module("matplotlib.pyplot")
     if given.picture is not None:
@@ -160,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     try:
         COMMANDS[given.command](given.command, given.options)
-    except (AssertionError, ValueError, ImportError, OSError, gym.error.Error) as error:
+    except (AssertionError, ValueError, ImportError, OSError, WorkerError, gym.error.Error) as error:
         if not str(error):
             raise
         sys.exit(f"error: {error}")

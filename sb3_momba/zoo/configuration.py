@@ -2,6 +2,7 @@
 
 import inspect
 import logging
+import re
 from collections.abc import Container
 from dataclasses import dataclass, field
 from importlib import resources
@@ -23,6 +24,7 @@ RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize", "env_kwargs", "callb
 ZOO_KEYS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "monitor_kwargs", "noise_type", "noise_std")
 EVALUATED_BY_RL_ZOO3 = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "monitor_kwargs", "normalize")
 LINEAR = "lin_"
+WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d{1,3}")
 N_TIMESTEPS = 1_000_000  # where neither file nor command line says
 POLICIES = MOMBA.policy_aliases
 NOT_FOR_CONFIGURATIONS = {
@@ -130,15 +132,19 @@ def with_schedules(hyperparameters: dict[str, Any]) -> dict[str, Any]:
     rate = hyperparameters.get("learning_rate")
     if not isinstance(rate, str):
         return hyperparameters
-    try:
-        start = float(rate.removeprefix(LINEAR))
-        if not start >= 0:
-            raise ValueError("out of range")
-    except ValueError as error:
-        raise ValueError(
-            f"learning_rate={rate!r}: give a number of at least 0, or {LINEAR}3e-4 to fall from it to 0."
-        ) from error
+    start = number_in(rate.removeprefix(LINEAR)) if rate.startswith(LINEAR) else None
+    if start is None:
+        raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or {LINEAR}3e-4 to fall from it to 0.")
     return {**hyperparameters, "learning_rate": LinearSchedule(start, 0.0, 1.0)}
+
+
+def number_in(text: str) -> float | None:
+    """A finite number of at least 0, if a text is one."""
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if 0 <= number < float("inf") else None
 
 
 def literal(value: Any) -> Any:
@@ -147,11 +153,8 @@ def literal(value: Any) -> Any:
         return {key: literal(item) for key, item in value.items()}
     if isinstance(value, list):
         return [literal(item) for item in value]
-    if isinstance(value, str):
-        try:
-            number = float(value)
-        except ValueError:
-            return value
+    if isinstance(value, str) and WITH_EXPONENT.fullmatch(value):
+        number = float(value)
         return int(number) if number.is_integer() else number
     return value
 

@@ -107,6 +107,10 @@ def main() -> None:
         complaints = judge(results, [refusal for refusal in known if objectives in refusal.objectives])
         wrong += [f"{title}: {complaint}" for complaint in complaints]
         with_two = sum(result["two_objectives"] for result in results.values() if result["outcome"] == "passed")
+        missing = [name for name in FILES if not any(test.startswith(f"test_{name}.py") for test in results)]
+        wrong += [f"{title}: no test of {name} uses SAC any more" for name in missing]
+        if objectives == 2 and with_two == 0:
+            wrong.append(f"{title}: no test had two")
         note = f"\n\n{with_two} of the tests that passed had two objectives." if objectives == 2 else ""
         tables.append(f"{title}\n\n{table(results)}{note}")
     reasons = [f"- {refusal.reason}" for refusal in known]
