@@ -57,7 +57,13 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         return self.policy_aliases[policy_name]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """SB3's; an environment with another number of objectives is refused before anything changes."""
+        """Train on another environment; SB3's signature. One that does not fit is refused before anything changes.
+
+        :param env: environment or VecEnv; an environment is put into PreferenceWrapper
+        :param force_reset: the next `learn` starts with a reset
+        :raises ValueError: for another number of objectives, observation or action space, or what MOMBA cannot train on
+        :raises AssertionError: for another number of environments; `load(path, env)` takes it
+        """
         venv = self._wrap_env(env, self.verbose)
         if n_objectives_of(venv) != self.n_objectives:
             raise ValueError(f"The model has {self.n_objectives} objectives, the environment {n_objectives_of(venv)}.")

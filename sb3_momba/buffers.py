@@ -38,7 +38,11 @@ class PreferenceReplayBuffer(ReplayBuffer):
     w to both.
 
     :param buffer_size: transitions, over all environments
-    :param observation_space: of the wrapped environment: [s, w]
+    :param observation_space: of the wrapped environment: [s, w], (observation_dim + preference_dim,)
+    :param action_space: (action_dim,); actions are stored scaled to [-1, 1]
+    :param device: of the minibatches; what is stored stays in main memory
+    :param n_envs: environments that add a transition at each step
+    :param optimize_memory_usage: SB3's switch, always off: a truncated episode's last state is stored nowhere else
     :param n_objectives: width of the rewards
     :param gamma: discount of the rewards within an n-step return
     :param n_steps: transitions that one reward sums over, cut short where an episode ends
@@ -46,6 +50,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
     :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
     :param seed: of the buffer's own random stream
     :param handle_timeout_termination: SB3's switch, always on: a truncated episode's last state keeps its value
+    :raises ValueError: for a switch that is turned, or a number out of its range
     """
 
     observation_space: spaces.Box
@@ -132,6 +137,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         :param reward: the scalar rewards, (n_envs,), or as another buffer holds them, (n_envs, n_objectives); used only where
             no PreferenceWrapper reports vectors
         :param infos: with `vector_reward` from PreferenceWrapper
+        :raises ValueError: for shapes that do not fit, numbers that are not finite, or a reward larger than 1e10 in size
         """
         vector_rewards = self._vector_rewards(reward, infos)
         for observations in (obs, next_obs):

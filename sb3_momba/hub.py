@@ -83,6 +83,9 @@ def load_from_hub(repo_id: str, filename: str = MODEL_NAME, *, revision: str | N
     :param filename: in the repository, such as "front.npz"
     :param revision: a commit, branch or tag; by default the newest
     :return: where the file lies on this machine
+    :raises huggingface_hub.errors.RepositoryNotFoundError: if there is none of this name, or it is private
+    :raises huggingface_hub.errors.RevisionNotFoundError: if it has no such revision
+    :raises huggingface_hub.errors.EntryNotFoundError: if it has no such file, or the hub cannot be reached
     """
     return hf_hub_download(
         repo_id, filename, revision=revision, token=token, library_name="sb3_momba", library_version=__version__
@@ -102,6 +105,8 @@ def package(
     """Write what `push_to_hub` uploads; its arguments.
 
     :param folder: for the files; it must be empty or not exist
+    :raises ValueError: for a folder that holds something, a run that is not finished, or a front that is not the model's
+    :raises FileFormatError: for a file of the run that is damaged
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -166,6 +171,12 @@ def model_card(
     steps: int,
     record: Record | None,
 ) -> ModelCard:
+    """The card: what the model is, its results, how to load it, and for a run how it was trained.
+
+    :param reference_point: of the hypervolume, (n_objectives,)
+    :param steps: environment steps of the training
+    :param record: of a run; a model on its own has none
+    """
     data = card_data(repo_id.split("/")[-1], front, reference_point, env, env_kwargs)
     versions = library_versions() if record is None else record.start["versions"]
     task = f"**{env}**" + (f" ({keywords(env_kwargs)})" if env_kwargs else "")
@@ -254,4 +265,5 @@ def usage(repo_id: str, front: ParetoFront, env: str, env_kwargs: dict[str, Any]
 
 
 def keywords(arguments: dict[str, Any]) -> str:
+    """As Python writes them in a call: "a=1, b='x'"."""
     return ", ".join(f"{name}={value!r}" for name, value in arguments.items())

@@ -61,20 +61,25 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
     :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
     :param target_entropy: of the policy on [-1, 1], in nats; "auto": -|A|
-    :param preference_sampler: `rng -> (n_objectives,)` for all environments; None leaves them theirs, by default uniform
-        on the simplex once an episode; or a literal as `make_sampler` takes it
-    :param precision: of the factors of matrix products in an update: "float32", "bfloat16", or "auto", bfloat16 where the
-        device has instructions for it
-    :param compile: the networks by torch.compile: updates in bfloat16 are some 20 % faster after a start of 10 to 60 s; needs
-        a C++ compiler
-    :param critic_minimum: "scalarised": the critic whose w.Q is lower (section 3.4.2); "objective": the lower Q of each
-        objective apart (CAPQL)
+    :param preference_sampler: `rng -> (n_objectives,)` for all environments, or a literal as `make_sampler` takes it; None
+        leaves them theirs, by default uniform on the simplex once an episode
+    :param precision: of an update's products: "float32", "bfloat16", or "auto", bfloat16 if the device has instructions for it
+    :param compile: the networks by torch.compile: bfloat16 updates some 20 % faster after 10 to 60 s; needs a C++ compiler
+    :param critic_minimum: "scalarised": the critic of lower w.Q (section 3.4.2); "objective": each objective's lower Q (CAPQL)
     :param critic_loss_reduction: over critics and objectives: "sum" (3.17) or "mean" (CAPQL)
     :param deterministic_exploration: collect data with the mean action (CAPQL's code) instead of a sample
     :param replay_buffer_class: PreferenceReplayBuffer or a subclass
+    :param replay_buffer_kwargs: see PreferenceReplayBuffer; they take precedence over MOMBA's own
+    :param optimize_memory_usage: SB3's switch, always off: see PreferenceReplayBuffer
     :param policy_kwargs: see SimbaPolicy, MlpPolicy and MombaPolicy
+    :param stats_window_size: episodes that the log's mean return and length are taken over
+    :param tensorboard_log: folder of TensorBoard's logs; None writes none
+    :param verbose: 0 prints nothing, 1 the log, 2 debugging messages too
+    :param seed: of networks, environments, exploration and replay buffer; None: another run each time
+    :param device: of the networks; "auto": the GPU if there is one
     :param others: SAC's own arguments, such as use_sde, where they ask for nothing
     :raises ValueError: for settings or environments that do not go together, naming them
+    :raises TypeError: for an argument that there is not, naming the nearest
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"SimbaPolicy": SimbaPolicy, "MlpPolicy": MlpPolicy}
@@ -199,9 +204,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self._skipped_updates = 0
 
     def _check_settings(self) -> None:
-        """
-        :raises ValueError: for options that do not go together, saying why
-        """
+        """:raises ValueError: for options that do not go together, saying why"""
         self._convert_train_freq()
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
@@ -274,7 +277,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
     # -------------------------------------------------------------------------------------------------- learning
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
-        """The gradient steps of Algorithm 1."""
+        """The gradient steps of Algorithm 1. One whose loss or gradient is not finite is skipped.
+
+        :param gradient_steps: how many, each on a minibatch of its own
+        :param batch_size: transitions per minibatch
+        :raises NonFiniteLossError: for MAX_SKIPPED_UPDATES in a row, each network as its last good step left it
+        """
         self.policy.set_training_mode(True)
         optimizers = [self.critic.optimizer, self.actor.optimizer]
         if self.ent_coef_optimizer is not None:
@@ -308,8 +316,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self._metrics.add({**critic_metrics, **actor_metrics, "ent_coef": alpha})
 
     def _rounded_products(self) -> contextlib.AbstractContextManager[None]:
-        """Inside, the factors of matrix products are rounded as `precision` says. One context for each loss: it keeps the
-        rounded weights."""
+        """Inside, products' factors are rounded as `precision` says. One context per loss: it keeps the rounded weights."""
         dtype = product_dtype(self.precision, self.device)
         return th.autocast(self.device.type, dtype, enabled=dtype != th.float32)  # type: ignore[return-value]
 
@@ -405,7 +412,13 @@ class MOMBA(PreferenceConditionedAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train for `total_timesteps` environment steps; SB3's signature."""
+        """Train; SB3's signature.
+
+        :param total_timesteps: environment steps, over all environments
+        :param log_interval: episodes between two logs
+        :param reset_num_timesteps: False counts on from the steps made so far
+        :raises NonFiniteLossError: if the training diverges, see `train`
+        """
         try:
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
@@ -416,18 +429,17 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     @classmethod
     def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Self:
-        """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)`
-        goes on exactly as if nothing had happened, callbacks of the same kinds in the same places included: SB3's own, and
-        others that have `state_dict` and `load_state_dict`.
-
-        The same holds for the bits of every number on the same machine with the same versions and number of threads, for
-        environments whose only randomness is Gymnasium's `np_random`. Where a running episode does not come out as it was, it
-        ends there, as truncated, with a warning.
+        """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)` goes
+        on exactly as if nothing had happened, callbacks of the same kinds in the same places included: SB3's own, and others
+        that have `state_dict` and `load_state_dict`. The same holds for the bits of every number on the same machine with the
+        same versions and number of threads, for environments whose only randomness is Gymnasium's `np_random`. Where a running
+        episode does not come out as it was, it ends there, as truncated, with a warning.
 
         :param path: folder of a MombaCheckpointCallback, or one of the checkpoints in it; damaged ones are passed over
         :param env: an environment of the same kind, and as many
         :param kwargs: of `load`
         :raises FileFormatError: if no checkpoint is whole, naming what is damaged
+        :raises ValueError: if `env` is not of that kind
         """
         return resume(cls, path, env, **kwargs)
 

@@ -27,13 +27,25 @@ class MombaPolicy(BasePolicy):
 
     `actor` and `critic` read normalised observations [(s - mean) / deviation, w]; `predict` and `normalize` take raw ones.
 
-    :param n_objectives: injected by MOMBA, like critic_loss, vector_values, best_return_scale and gamma
+    :param observation_space: of [s, w], (observation_dim + preference_dim,)
+    :param action_space: a bounded Box, (action_dim,)
+    :param lr_schedule: learning rate as a function of the remaining progress, 1 at the start
+    :param actor_architecture: builds the actor's layers
+    :param critic_architecture: builds the layers of each critic
+    :param n_objectives: injected by MOMBA, like the next four; see there
+    :param critic_loss: "ce" or "mse"
+    :param vector_values: critics of the vector return
+    :param best_return_scale: what the largest return seen is scaled to
+    :param gamma: discount of the returns that are scaled
     :param n_critics: size of the ensemble
     :param n_atoms: atoms of a return distribution (critic_loss="ce")
     :param support: first and last atom, in scaled returns
     :param normalize_observations: by their running mean and deviation
+    :param normalize_weights: unit-norm rows of the linear layers
     :param capql_log_prob: log pi as CAPQL's code has it: of the action within the environment's bounds, with 1e-6 inside
         the logarithm, clamped to [-1000, 1000]
+    :param optimizer_class: of actor and critics, each with its own
+    :param optimizer_kwargs: of its constructor, without the learning rate
     """
 
     action_space: spaces.Box
@@ -103,7 +115,7 @@ class MombaPolicy(BasePolicy):
             )
 
     def normalize(self, observations: th.Tensor) -> th.Tensor:
-        """[s, w] -> [(s - mean) / deviation, w]; preferences stay as they are."""
+        """[s, w] -> [(s - mean) / deviation, w], (batch, observation_dim + preference_dim); preferences stay as they are."""
         observations = observations.float()
         if not self.normalize_observations:
             return observations
@@ -153,6 +165,10 @@ class MombaPolicy(BasePolicy):
         return policy.to(get_device(device))
 
     def forward(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        """Actions on [-1, 1]: raw [s, w], (batch, observation_dim + preference_dim) -> (batch, action_dim).
+
+        :param deterministic: the mean action instead of a sample
+        """
         return self._predict(observation, deterministic)
 
     def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:  # type: ignore[override]
@@ -160,7 +176,10 @@ class MombaPolicy(BasePolicy):
 
 
 class SimbaPolicy(MombaPolicy):
-    """SimbaV2 actor and critics (section 3.3); the defaults are Table B.1's.
+    """SimbaV2 actor and critics (Lee et al., 2025; section 3.3); the defaults are Table B.1's.
+
+    `predict` takes [s, w], (batch, observation_dim + preference_dim), and gives actions, (batch, action_dim), in the
+    environment's bounds.
 
     :param actor_hidden_dim: width of the actor's embedding
     :param actor_blocks: its hidden blocks
@@ -208,7 +227,10 @@ class SimbaPolicy(MombaPolicy):
 
 
 class MlpPolicy(MombaPolicy):
-    """Dense networks, as SB3's SAC has them (the MLP architecture of section 4.3).
+    """Dense networks, as SB3's SAC has them (Haarnoja et al., 2018; the MLP architecture of section 4.3).
+
+    `predict` takes [s, w], (batch, observation_dim + preference_dim), and gives actions, (batch, action_dim), in the
+    environment's bounds.
 
     :param net_arch: widths of the hidden layers, or `dict(pi=[...], qf=[...])` for actor and critics apart
     :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)

@@ -34,6 +34,9 @@ class MombaCheckpointCallback(BaseCallback):
     :param save_freq: environment steps, over all training environments
     :param path: folder of the checkpoints
     :param keep: how many of them stay
+    :param verbose: 1 prints a line for each checkpoint
+    :raises ValueError: for save_freq or keep below 1; when the training starts, for a folder that another process writes
+        into, or that holds checkpoints of another training with more steps
     """
 
     model: "MOMBA"
@@ -108,7 +111,11 @@ class MombaCheckpointCallback(BaseCallback):
         self.is_between_rollouts = True
 
     def after_learn(self) -> None:
-        """However `learn` has ended."""
+        """However `learn` has ended: the signals and the folder are free again.
+
+        :raises KeyboardInterrupt: if SIGINT came meanwhile
+        :raises SystemExit: if SIGTERM did
+        """
         self._restore_handlers()
         self.lock.close()
         if self.received is not None:
@@ -124,7 +131,11 @@ class MombaCheckpointCallback(BaseCallback):
             )
 
     def save(self) -> None:
-        """Write a checkpoint now; not while updates are skipped, so that a training that diverges leaves its last good ones."""
+        """Write a checkpoint now; not while updates are skipped, so that a training that diverges leaves its last good ones.
+
+        :raises OSError: if it cannot be written; older checkpoints stay
+        :raises TypeError: names an attribute that cannot be stored without pickle
+        """
         if self.model._skipped_updates > 0:
             logger.warning("No checkpoint at %d steps: updates are being skipped.", self.model.num_timesteps)
             return

@@ -37,6 +37,8 @@ def check_mo_env(env: EnvLike, n_steps: int = 1_000, seed: int = 0, env_kwargs: 
 
     :param env: id, callable or environment, as its author wrote it: with its vector reward, without PreferenceWrapper
     :param n_steps: how long, over as many episodes as that takes
+    :param seed: of the first reset and of the actions, uniform within their bounds
+    :param env_kwargs: of an id or a callable; an environment that exists takes none
     :raises ValueError: naming what is wrong, and the cure
     """
     made = make_env(env, env_kwargs)

@@ -86,7 +86,10 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         return None if self._preference is None else self._preference.copy()
 
     def set_preference(self, preference: Sequence[float] | np.ndarray | None) -> None:
-        """Fix the preference from the next observation on; None hands it back to the sampler."""
+        """Fix the preference, (n_objectives,), from the next observation on; None hands it back to the sampler.
+
+        :raises ValueError: if it is not on the simplex, or has another shape
+        """
         self._fixed_preference = None if preference is None else self._one_preference(preference)
         self._holds_for_episode = self._holds_for_episode and preference is None
 
@@ -103,7 +106,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self.env_index = index
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """`options["preference"]`, (n_objectives,), holds for this episode; all other options go to the environment."""
+        """Start an episode.
+
+        :param seed: of the environment, and of the sampler's own random stream
+        :param options: `preference`, (n_objectives,), holds for this episode; all others go to the environment
+        :return: [observation, w], float32 (observation_dim + preference_dim,), and the environment's info
+        :raises ValueError: for a preference off the simplex, or an observation that is not finite or not of its space's shape
+        """
         given = None
         if options is not None and "preference" in options:
             options = dict(options)
@@ -127,6 +136,14 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         return self._observe(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
+        """One step of the environment, its reward scalarised by the preference that the action saw.
+
+        :param action: (action_dim,), within the action space's bounds
+        :return: [next observation, next w], float32 (observation_dim + preference_dim,); w . r, in the unit of the rewards;
+            terminated; truncated; and info with `vector_reward` and `preference`, both float32 (n_objectives,)
+        :raises ValueError: for an observation or a reward that is not finite or not of its declared shape, a reward larger
+            than 1e10 in size, or what a sampler drew that is no preference
+        """
         self._note_action(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         assert self._preference is not None, "call reset() before step()"
@@ -343,10 +360,18 @@ def make_mo_vec_env(
 
     SB3's `make_vec_env(wrapper_class=...)` would put the wrapper outside Monitor, where vector rewards cannot pass.
 
+    Observations are [s, w], float32 (n_envs, observation_dim + preference_dim); rewards w . r, (n_envs,), each r in its
+    environment's info as `vector_reward`, (n_objectives,).
+
     :param env: id or callable that makes a new environment
+    :param n_envs: copies, at least one
     :param seed: environment i starts with seed + i
     :param preference_sampler: for every copy; each has its own random stream
+    :param env_kwargs: of the id or the callable
     :param vec_env_cls: with SubprocVecEnv, processes are watched over: see WatchedSubprocVecEnv
+    :param vec_env_kwargs: of its constructor
+    :raises ValueError: for an environment that exists already, n_envs below 1, or what PreferenceWrapper refuses
+    :raises WorkerError: with SubprocVecEnv, where a process raises an error or dies
     """
     if isinstance(env, gym.Env):
         raise ValueError("make_mo_vec_env needs an id or a callable that makes new environments, not one environment.")

@@ -45,12 +45,20 @@ class ParetoEvalCallback(EventCallback):
     :param eval_env: id, callable, environment or VecEnv; see `evaluate_front`. By default copies of the training environment,
         which must come from an id, and its wrappers from Gymnasium's recordable ones
     :param eval_freq: environment steps, over all training environments
+    :param n_preferences: how many equally spaced preferences; see `preference_grid`
+    :param n_episodes: per preference
+    :param seed: of each preference's first episode, the same in every evaluation
     :param reference_point: of the hypervolume, (n_objectives,); 0 by default
+    :param deterministic: the policy's mean action instead of a sample
     :param log_path: folder for `pareto_evaluations.npz`, `front.npz` and `front.png`
     :param best_model_save_path: folder for `best_model.zip`, the model of the largest hypervolume
     :param callback_on_new_best: called after each new best hypervolume
     :param callback_after_eval: called after each evaluation; may stop the training
+    :param objectives: names of the picture's axes, n_objectives of them
     :param n_workers: processes that share the episodes of an evaluation
+    :param verbose: 1 prints a line for each evaluation
+    :raises ValueError: for eval_freq or n_workers below 1; when the training starts, for what `check` finds, or an eval_env
+        that is the training environment
     """
 
     def __init__(
@@ -138,11 +146,15 @@ class ParetoEvalCallback(EventCallback):
         return [measured["hypervolume" if is_vector else "expected_utility"] for measured in self.metrics]
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint: what has been measured, and when to measure next."""
+        """For a checkpoint: what has been measured, the newest front among it, and when to measure next."""
         front = None if self.front is None else vars(self.front)
         return {"front": front, **{name: getattr(self, name) for name in STATE}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what `state_dict` gave.
+
+        :raises KeyError: if something is missing in it
+        """
         self.front = None if state["front"] is None else ParetoFront(**state["front"])
         for name in STATE:
             setattr(self, name, state[name])

@@ -57,6 +57,7 @@ class ParetoFront:
 
     @property
     def n_objectives(self) -> int:
+        """Width of preferences and returns."""
         return int(self.preferences.shape[1])
 
     def non_dominated(self) -> NDArray[np.bool_]:
@@ -64,15 +65,15 @@ class ParetoFront:
         return metrics.non_dominated(self.values)
 
     def hypervolume(self, reference_point: ArrayLike | None = None) -> float:
-        """Eq. (4.1); the reference point is 0 by default."""
+        """HV, eq. (4.1), above a reference point, (n_objectives,); 0 by default."""
         return metrics.hypervolume(self.values, np.zeros(self.n_objectives) if reference_point is None else reference_point)
 
     def expected_utility(self) -> float:
-        """Eq. (4.2), over the evaluated preferences."""
+        """EUM, eq. (4.2), over the evaluated preferences, in the unit of the scalarised return."""
         return metrics.expected_utility(self.values, self.preferences)
 
     def preference_regret(self) -> float:
-        """What asking for a preference loses against the best policy found for it."""
+        """What asking for a preference loses against the best policy found for it, in the unit of the scalarised return."""
         return metrics.preference_regret(self.values, self.preferences)
 
     def metrics(self, reference_point: ArrayLike | None = None) -> dict[str, float]:
@@ -81,12 +82,20 @@ class ParetoFront:
         return metrics.summarise(self.values, self.preferences, reference)
 
     def save(self, path: FilePath) -> None:
-        """Write one file, ".npz" appended if it has no suffix, atomically and without pickle."""
+        """Write one file, ".npz" appended if it has no suffix, atomically and without pickle.
+
+        :raises TypeError: names a setting that cannot be stored without pickle
+        :raises OSError: if the file cannot be written; an old one stands
+        """
         write_tree(with_suffix(path, ".npz"), {"format": FRONT_FORMAT, "version": FRONT_VERSION, **vars(self)})
 
     @classmethod
     def load(cls, path: FilePath) -> "ParetoFront":
-        """:raises FileFormatError: if the file is damaged or no front"""
+        """A front from the file that `save` wrote; nothing of it is executed.
+
+        :raises FileNotFoundError: if there is no such file
+        :raises FileFormatError: if the file is damaged or no front
+        """
         tree, _ = read_tree(with_existing_suffix(path, ".npz"))
         if not isinstance(tree, dict) or tree.pop("format", None) != FRONT_FORMAT:
             raise FileFormatError(f"{path} holds no Pareto front.")
@@ -131,12 +140,18 @@ def evaluate_front(
     :param env: an id or a callable runs up to 128 copies side by side; a VecEnv as many as it has; an environment that
         exists already, one episode after the other
     :param n_preferences: how many equally spaced preferences; see `preference_grid`
-    :param preferences: to evaluate instead, (P, n_objectives)
+    :param n_episodes: per preference
+    :param seed: of each preference's first episode
+    :param preferences: to evaluate instead, (P, n_objectives), each on the simplex
     :param gamma: of the discounted returns; the model's own by default, 0.99 where it has none
-    :param deterministic: the policy's mean action
+    :param deterministic: the policy's mean action instead of a sample
+    :param env_kwargs: of an id or a callable; an environment that exists takes none
     :param n_workers: processes that share the episodes; for an id or a callable. As with SB3's SubprocVecEnv, a script needs
         `if __name__ == "__main__":`
-    :return: P preferences in the order of the grid
+    :return: P preferences in the order of the grid; returns (P, E, n_objectives), in the units of the rewards, E = n_episodes
+        or 1
+    :raises ValueError: for a number below 1, a preference off the simplex, or an environment that does not fit the model
+    :raises WorkerError: if one of several processes dies or hangs
     """
     if n_workers < 1 or (n_workers > 1 and isinstance(env, VecEnv | gym.Env)):
         raise ValueError(f"n_workers={n_workers}: at least one; more of them need an id or a callable that makes environments.")

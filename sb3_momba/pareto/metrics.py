@@ -28,7 +28,9 @@ def as_points(values: ArrayLike, name: str = "values", at_least: int = 0) -> Arr
 def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
     """HV, eq. (4.1): the volume between the reference point and what the values dominate, in the product of their units.
 
+    :param values: (n_solutions, n_objectives); none give 0
     :param reference_point: (n_objectives,); values that are not above it in every objective count for nothing
+    :raises ValueError: for another shape, or an entry that is not finite
     """
     points = as_points(values)
     reference = np.asarray(reference_point, dtype=np.float64)
@@ -45,15 +47,24 @@ def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
 
 
 def expected_utility(values: ArrayLike, preferences: ArrayLike) -> float:
-    """EUM, eq. (4.2): the mean over preferences w of max_i w . V_i, in the unit of the scalarised return."""
+    """EUM, eq. (4.2): the mean over preferences w of max_i w . V_i, in the unit of the scalarised return.
+
+    :param values: V_i, (n_solutions, n_objectives)
+    :param preferences: w, (n_preferences, n_objectives)
+    :raises ValueError: for another shape, no rows, or an entry that is not finite
+    """
     return float(_utilities(values, preferences).max(axis=1).mean())
 
 
 def preference_regret(values: ArrayLike, preferences: ArrayLike) -> float:
-    """The mean over w of max_i w . V_i - w . V_w: what a user loses who asks for w, because the policy answers another
-    preference better. EUM hides it.
+    """The mean over w of max_i w . V_i - w . V_w, in the unit of the scalarised return: what a user loses who asks for w,
+    because the policy answers another preference better. EUM hides it. At least 0, and better when smaller.
+
+    A metric of this project; the thesis has none like it.
 
     :param values: V_w for each preference, in their order, (n_preferences, n_objectives)
+    :param preferences: w, (n_preferences, n_objectives)
+    :raises ValueError: for another shape, no rows, an entry that is not finite, or not one value per preference
     """
     utilities = _utilities(values, preferences)
     if utilities.shape[0] != utilities.shape[1]:
@@ -62,9 +73,13 @@ def preference_regret(values: ArrayLike, preferences: ArrayLike) -> float:
 
 
 def inverted_generational_distance(values: ArrayLike, reference_front: ArrayLike) -> float:
-    """IGD, eq. (4.3): the mean distance from each point of a reference front to the nearest value.
+    """IGD, eq. (4.3): the mean Euclidean distance from each point of a reference front to the nearest value.
 
     Objectives of different units should be normalised first (section 4.4: the front's range to [0, 1]).
+
+    :param values: (n_solutions, n_objectives)
+    :param reference_front: (n_points, n_objectives)
+    :raises ValueError: for another shape, no rows, or an entry that is not finite
     """
     points, front = as_points(values, at_least=1), as_points(reference_front, "reference_front", at_least=1)
     if points.shape[1] != front.shape[1]:

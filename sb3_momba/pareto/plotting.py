@@ -33,6 +33,7 @@ def plot_front(
     :param fronts: a ParetoFront, its values (n, n_objectives), or several of them under the names of the legend
     :param path: where to write the picture; its suffix chooses the format
     :param objectives: the axes' labels
+    :param title: above the picture; none by default
     :raises ValueError: for another number of objectives, or fronts that differ in it
     """
     named = dict(fronts) if isinstance(fronts, Mapping) else {"": fronts}

@@ -152,6 +152,11 @@ COMMANDS = {"train": train, "enjoy": enjoy, "optimize": train, "plot": plot}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one of rl_zoo3's scripts with MOMBA registered.
+
+    :param arguments: of the command line, the program's own by default
+    :raises SystemExit: for what the user can mend, with one line that says how; after --help too
+    """
     parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=COMMANDS, help="each has --help")
     parser.add_argument("options", nargs=argparse.REMAINDER, help="rl_zoo3's, and those of the manual")
