@@ -129,7 +129,8 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         if preference is None:
             if width == raw != wrapped:
                 raise ValueError(
-                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights."
+                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights; "
+                    "for EvalCallback and evaluate_policy, make the environment by make_mo_vec_env."
                 )
             return observation
         w = check_preference(preference, self.n_objectives)

@@ -7,6 +7,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.noise import ActionNoise
 from torch import nn
 
 from sb3_momba.buffers import PreferenceReplayBuffer
@@ -88,6 +89,12 @@ def check_settings(model: Any) -> None:
         raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or a function of the remaining progress.")
     if scale is not None and not (is_number(scale) and scale > 0):
         raise ValueError(f"best_return_scale={scale!r}: give a number above 0, or None to leave rewards as they are.")
+    noise = settings["action_noise"]
+    if noise is not None and not isinstance(noise, ActionNoise):
+        raise ValueError(f"action_noise={noise!r}: give an ActionNoise of stable_baselines3.common.noise, or None.")
+    mean: Any = getattr(noise, "_mu", None)
+    if mean is not None and np.shape(mean) not in ((), model.action_space.shape):
+        raise ValueError(f"action_noise={noise!r} has shape {np.shape(mean)}, an action {model.action_space.shape}.")
     if entropy != "auto" and not is_number(entropy):
         raise ValueError(f'target_entropy={entropy!r}: give "auto" or a number of nats.')
     _check_together(model, settings)

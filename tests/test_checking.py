@@ -122,3 +122,12 @@ def test_an_environment_without_spaces_or_in_our_wrapper_is_refused():
 def test_what_is_seldom_meant_is_a_warning(settings, message):
     with pytest.warns(UserWarning, match=message):
         check_mo_env(Fresh, n_steps=30, env_kwargs=settings)
+
+
+def test_a_reset_without_options_is_named():
+    class Old(Fresh):
+        def reset(self, seed=None):
+            return super().reset(seed=seed)
+
+    with pytest.raises(ValueError, match=r"reset takes \['seed'\]: write def reset\(self, \*, seed=None, options=None\)"):
+        check_mo_env(Old())

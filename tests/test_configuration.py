@@ -41,7 +41,7 @@ def test_the_environments_arguments_come_from_the_file_and_the_command_line(tmp_
 )
 def test_entries_that_cannot_be_are_named(entry: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        check_entry("my.yml", entry)
+        check_entry(entry)
 
 
 def test_what_only_rl_zoo3_can_do_is_an_error_elsewhere(tmp_path) -> None:

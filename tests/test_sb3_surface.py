@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_momba import MOMBA, make_mo_vec_env
 from tests.stubs import StubEnv, assert_same_tree, tiny_model
@@ -142,3 +143,16 @@ def test_timeouts_are_always_told_from_ends():
     tiny_model(StubEnv(), replay_buffer_kwargs={"handle_timeout_termination": True})
     with pytest.raises(ValueError, match=r"handle_timeout_termination=False takes .*leave it True"):
         tiny_model(StubEnv(), replay_buffer_kwargs={"handle_timeout_termination": False})
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        ("normal", "action_noise='normal': give an ActionNoise"),
+        (NormalActionNoise(np.zeros(3), np.ones(3)), r"has shape \(3,\), an action \(2,\)"),
+    ],
+    ids=["a name", "another shape"],
+)
+def test_action_noise_that_cannot_be_is_named(noise, message):
+    with pytest.raises(ValueError, match=message):
+        tiny_model(StubEnv(), action_noise=noise)

@@ -115,7 +115,10 @@ def test_shipped_configurations_and_parameters_from_the_command_line(folder: Pat
 def test_unknown_names_are_errors(folder: Path) -> None:
     code, said = zoo(folder, f"train --env {TASK} --conf tiny.yml -params btach_size:3")
     assert code == 1
-    assert said.splitlines()[-1] == "error: tiny.yml: MOMBA has no hyperparameter 'btach_size': did you mean 'batch_size'?"
+    assert (
+        said.splitlines()[-1]
+        == "error: tiny.yml, or -params: MOMBA has no hyperparameter 'btach_size': did you mean 'batch_size'?"
+    )
     assert "Traceback" not in said
 
 
@@ -146,7 +149,7 @@ def test_a_trial_becomes_arguments_of_momba() -> None:
     trial = LowestTrial()
     sampled = sample_params(trial, n_actions=3, n_envs=1, additional_args={})
     assert sampled == convert_params(trial.params)
-    assert check_entry("a trial", sampled) == {"policy": "SimbaPolicy", **sampled}  # all of them names of MOMBA's
+    assert check_entry(sampled) == {"policy": "SimbaPolicy", **sampled}  # all of them names of MOMBA's
     assert (sampled["gamma"], sampled["batch_size"], sampled["gradient_steps"]) == (1 - 3e-3, 64, 1)
 
 
@@ -167,3 +170,9 @@ class LowestTrial:
 
     def set_user_attr(self, name: str, value: object) -> None:
         self.user_attrs[name] = value
+
+
+def test_plots_of_what_never_ran_are_refused(folder: Path) -> None:
+    code, said = zoo(folder, "plot all_plots -e mo-hoper --picture none.png")
+    assert code == 1
+    assert said.splitlines()[-1] == "error: --env mo-hoper: no run of momba in logs has this name."

@@ -1,5 +1,6 @@
 """Whether an environment of one's own is what a training needs."""
 
+import inspect
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -79,6 +80,11 @@ def _check_interface(env: gym.Env, seed: int) -> None:
     for name in ("observation_space", "action_space"):
         if not isinstance(getattr(env, name, None), spaces.Space):
             raise ValueError(f"{type(env).__name__} has no {name}: set self.{name} = gymnasium.spaces.Box(...) in __init__.")
+    arguments = inspect.signature(env.reset).parameters
+    if not all(name in arguments for name in ("seed", "options")) and "kwargs" not in arguments:
+        raise ValueError(
+            f"reset takes {list(arguments)}: write def reset(self, *, seed=None, options=None), as Gymnasium has it."
+        )
     start: Any = env.reset(seed=seed)
     if not (isinstance(start, tuple) and len(start) == 2):
         raise ValueError(f"reset returned {_in_short(start)}: return (observation, info).")

@@ -131,16 +131,22 @@ def plot(command: str, arguments: Sequence[str]) -> None:
         parser.add_argument("-e", "--env", nargs="+", help="raw ids, or momba/ ids")
         parser.add_argument("-f", "--exp-folder", "--exp-folders", nargs="+", default=["logs"], help="logs by default")
     given, options = read(parser, rest)
+    script = getattr(import_rl_zoo3("rl_zoo3.plots"), name)
     if name != "plot_from_file" and not wants_help(options):
         if given.env is None:
             raise ValueError(NO_ENV)
         # rl_zoo3 looks for them in its folders' names, where a momba/ id has one dash and a raw one its own dots.
         names_of_folders = [env.replace("/", "-" if env.startswith(PREFIX) else ".") for env in given.env]
+        for env, of_folder in zip(given.env, names_of_folders, strict=True):
+            if not any(any(Path(folder, algo).glob(f"*{of_folder}*")) for folder in given.exp_folder for algo in given.algo):
+                raise ValueError(
+                    f"--env {env}: no run of {', '.join(given.algo)} in {', '.join(given.exp_folder)} has this name."
+                )
         options += ["-a", *given.algo, "-f", *given.exp_folder, "-e", *names_of_folders]
     pyplot = importlib.import_module("matplotlib.pyplot")
     if given.picture is not None:
         pyplot.switch_backend("agg")
-    call(getattr(import_rl_zoo3("rl_zoo3.plots"), name), f"{command} {name}", options)
+    call(script, f"{command} {name}", options)
     if given.picture is not None:
         numbers = pyplot.get_fignums()
         for number in numbers:

@@ -87,7 +87,11 @@ def read_configuration(name: str, env_id: str) -> Configuration:
     :param name: path of a yaml file, or name of a shipped one, such as "capql"
     :raises ValueError: for a missing file or entry, and for unknown keys, with the nearest known name
     """
-    entry = check_entry(name, find_entry(name, env_id)[1])
+    _, found = find_entry(name, env_id)
+    try:
+        entry = check_entry(found)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     for key in ZOO_KEYS:
         if entry.get(key) is not None:
             raise ValueError(f"{name}: {key} needs rl_zoo3: train with python -m sb3_momba.zoo train, or leave it out.")
@@ -99,28 +103,24 @@ def read_configuration(name: str, env_id: str) -> Configuration:
     )
 
 
-def check_entry(name: str, entry: dict[str, Any]) -> dict[str, Any]:
+def check_entry(entry: dict[str, Any]) -> dict[str, Any]:
     """An entry of a yaml file with numbers for numbers and the default policy.
 
-    :param name: of the file, for messages
     :raises ValueError: for what cannot be, and for unknown keys, with the nearest known name
     """
     entry = {"policy": "SimbaPolicy", **literal(entry)}
     for key in EVALUATED_BY_RL_ZOO3:
         if isinstance(entry.get(key), str):
-            raise ValueError(f"{name}: {key}={entry[key]!r} is Python code, and nothing is evaluated: write a mapping.")
+            raise ValueError(f"{key}={entry[key]!r} is Python code, and nothing is evaluated: write a mapping.")
     if entry.get("normalize"):
-        raise ValueError(f"{name}: normalize must be false: the policy normalises observations and rewards itself.")
+        raise ValueError("normalize must be false: the policy normalises observations and rewards itself.")
     for key in ("n_timesteps", "n_envs"):
         if key in entry:
             if isinstance(entry[key], float) and entry[key].is_integer():  # !!float 1e6
                 entry[key] = int(entry[key])
-            check_whole(f"{name}: {key}", entry[key], 1)
+            check_whole(key, entry[key], 1)
     own = {key: value for key, value in entry.items() if key not in (*RUN_KEYS, *ZOO_KEYS)}
-    try:
-        check_hyperparameters(entry["policy"], own)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
+    check_hyperparameters(entry["policy"], own)
     return entry
 
 

@@ -54,7 +54,10 @@ class MombaExperimentManager(exp_manager.ExperimentManager):
             given, _ = super().read_hyperparameters()
         finally:
             self.env_name = task
-        entry = check_entry(self.config, given)
+        try:
+            entry = check_entry(given)
+        except ValueError as error:
+            raise ValueError(f"{self.config}, or -params: {error}") from error
         entry.setdefault("n_timesteps", N_TIMESTEPS)
         if not self.eval_env_kwargs:
             self.eval_env_kwargs = entry.get("env_kwargs") or {}
