@@ -43,6 +43,7 @@ setup(
         "test": [
             "sb3-momba[baselines,export,hub,zoo]",
             "onnxruntime>=1.18",
+            "wandb>=0.19",
             "pymoo>=0.6",
             "rliable>=1.2",
             "pandas<3",  # rliable's bootstrap library fails with newer ones
