@@ -64,7 +64,6 @@ class MombaCheckpointCallback(BaseCallback):
 
     def _begin(self, buffer: "PreferenceReplayBuffer") -> None:
         """Go on with the segments of the checkpoint that this training was resumed from, or with none."""
-        self.buffer = buffer
         self.writer.checksums = {}
         checkpoint, resumed_buffer = self.model._resumed_from or (None, None)
         if checkpoint is not None and buffer is resumed_buffer and checkpoint.folder.parent.resolve() == self.path:
@@ -74,6 +73,7 @@ class MombaCheckpointCallback(BaseCallback):
                 f"{self.path} holds checkpoints of another training, up to {found:,} steps, which new ones would displace: go "
                 "on with MOMBA.resume, or choose another folder."
             )
+        self.buffer = buffer
 
     def _on_training_start(self) -> None:
         self.lock.enter_context(alone_in(self.path))

@@ -35,7 +35,7 @@ def write_segments(buffer: PreferenceReplayBuffer, writer: CheckpointWriter) -> 
     oldest, last = buffer.n_added - buffer.size(), max(buffer.n_added - 1, 0)
     names = [name for name in writer.checksums if rows_of(name)[1] > oldest]
     if any(map(writer.lacks, names)):
-        names = []
+        writer.checksums, names = {}, []
     first = max(rows_of(names[-1])[1] if names else 0, oldest)
     if first < last:
         names.append(segment_name(first, last))
