@@ -17,7 +17,7 @@ setup(
     license="MIT",
     license_files=["LICENSE"],
     packages=find_packages(include=["sb3_momba", "sb3_momba.*"]),
-    package_data={"sb3_momba": ["py.typed", "envs/riesz_100.npz", "zoo/hyperparams/*.yml"]},
+    package_data={"sb3_momba": ["py.typed", "envs/riesz.npz", "zoo/hyperparams/*.yml", "benchmark/grids/*.yml"]},
     python_requires=">=3.10",
     install_requires=[
         "stable-baselines3>=2.9,<3",
@@ -37,11 +37,12 @@ setup(
     ],
     extras_require={
         "baselines": ["morl-baselines>=1.3"],
+        "benchmark": ["ray[tune]>=2.40"],  # sweeps; grids on one machine need nothing
         "export": ["onnx>=1.16"],  # .onnx files; TorchScript needs nothing
         "hub": ["huggingface_hub>=0.30"],
         "zoo": ["rl_zoo3>=2.9,<3", "seaborn>=0.13", "pandas>=2.2,<3"],  # the last two for its plots
         "test": [
-            "sb3-momba[baselines,export,hub,zoo]",
+            "sb3-momba[baselines,benchmark,export,hub,zoo]",
             "onnxruntime>=1.18",
             "wandb>=0.19",
             "pymoo>=0.6",

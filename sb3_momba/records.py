@@ -12,7 +12,7 @@ A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has a
   count), `versions`, `machine`, `git_revision` and `started`.
 - `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `returns` and `discounted_returns`
   (n, episodes, n_objectives), `episode_lengths` (n, episodes), the `preferences` that they answer and its `settings`; one that
-  "failed" has its `error`.
+  "failed" has its `error` and, if it failed while it ran, the `traceback`.
 
 Values are mean undiscounted returns. With `general_policy` they are those of one policy under each preference, in their order,
 and n is P; without it they are a set of n solutions, such as the policies of PGMORL, and there is no `preference_regret`.
@@ -29,6 +29,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from traceback import format_exception
 from types import TracebackType
 from typing import Any
 
@@ -113,7 +114,9 @@ class RecordWriter:
         with self.file:
             if isinstance(error, Exception) and not self.is_ended:
                 self.is_ended = True
-                self.append("end", status="failed", error=f"{type(error).__name__}: {error}".removesuffix(": "))
+                lines = format_exception(error)
+                text = f"{type(error).__name__}: {error}".removesuffix(": ")
+                self.append("end", status="failed", error=text, traceback="".join(lines))
 
 
 def _provenance() -> dict[str, Any]:
@@ -174,7 +177,8 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Record:
-    """A record as it was read. `error` is None for a run that finished; one without an end counts as failed."""
+    """A record as it was read. `error` is None for a run that finished; one without an end counts as failed. `traceback` is
+    empty where none was recorded."""
 
     path: Path
     label: str
@@ -191,6 +195,7 @@ class Record:
     evaluations: list[Evaluation]
     final_values: Array | None
     error: str | None
+    traceback: str = ""
 
     @property
     def task(self) -> str:
@@ -269,6 +274,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
     evaluations: list[Evaluation] = []
     final_values: Array | None = None
     error: str | None = UNENDED
+    traceback = ""
     for event in events[1:]:
         if event["event"] == "resumed" and final_values is None:
             resumed_at = _whole(event["steps"], "steps")
@@ -289,7 +295,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
             returns = _numbers(event["front"]["returns"], "the front's returns", (shape[0], None, shape[1]))
             final_values, error = returns.mean(axis=1), None
         elif event["event"] == "end":
-            final_values, error = None, str(event["error"])
+            error, traceback = str(event["error"]), str(event.get("traceback", ""))
         else:
             raise FileFormatError(f"it has an unknown event {event['event']!r}.")
     return Record(
@@ -308,6 +314,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         evaluations=evaluations,
         final_values=final_values,
         error=error,
+        traceback=traceback,
     )
 
 

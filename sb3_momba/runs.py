@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.checkpoints.folders import checkpoints_in
-from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
 from sb3_momba.files import LOCK, alone_in
 from sb3_momba.momba import MOMBA
@@ -50,6 +50,7 @@ class RunSettings:
     :param checkpoint_freq: environment steps between checkpoints
     :param keep_checkpoints: how many of them stay
     :param reference_point: of the hypervolume; None: the task's in `pareto/protocol.py`
+    :param preference: to train and evaluate for alone, as the fixed-preference runs of section 4.2.4; None: for all
     """
 
     env: str
@@ -66,6 +67,7 @@ class RunSettings:
     n_preferences: int = protocol.N_PREFERENCES
     n_episodes: int = protocol.N_EPISODES
     reference_point: list[float] | None = None
+    preference: list[float] | None = None
     objectives: list[str] | None = None
     eval_workers: int = 1
     checkpoint_freq: int = 10_000
@@ -105,17 +107,19 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
     """
     check_hyperparameters(settings.policy, settings.hyperparameters)
     check_whole("steps", settings.steps, 1)
+    hyperparameters = hyperparameters_of(settings)
     folder = Path(settings.output)
     make_one = partial(make_env, settings.env, settings.env_kwargs)
     env = make_mo_vec_env(make_one, settings.n_envs, vec_env_cls=SubprocVecEnv if settings.subprocesses else DummyVecEnv)
     try:
         reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives_of(env))
+        preferences = preferences_of(settings, n_objectives_of(env))
         record = RecordWriter(folder / RECORD_NAME)
         evaluation = ParetoEvalCallback(
             make_one,
             eval_freq=settings.eval_freq,
-            n_preferences=settings.n_preferences,
             n_episodes=settings.n_episodes,
+            preferences=preferences,
             reference_point=reference_point,
             objectives=settings.objectives,
             n_workers=settings.eval_workers,
@@ -126,17 +130,38 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
         if resumed:
             model = MOMBA.resume(folder / CHECKPOINTS, env, device=settings.device)
         else:
-            hyperparameters = with_schedules(settings.hyperparameters)
-            model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **hyperparameters)
+            model = MOMBA(settings.policy, env, seed=settings.seed, device=settings.device, **with_schedules(hyperparameters))
         evaluation.check(model)
-        preferences = preference_grid(model.n_objectives, settings.n_preferences)
         yield Prepared(model, evaluation, record, preferences, reference_point)
     finally:
         env.close()
 
 
-def run(settings: RunSettings) -> RunResult:
-    """Train, evaluate and write the run's folder."""
+def hyperparameters_of(settings: RunSettings) -> dict[str, Any]:
+    """MOMBA's arguments, with the sampler of a run for one preference.
+
+    :raises ValueError: for such a run with another sampler
+    """
+    if settings.preference is None:
+        return settings.hyperparameters
+    given = settings.hyperparameters.get("preference_sampler")
+    if given not in (None, settings.preference):
+        raise ValueError(f"preference={settings.preference} and preference_sampler={given!r}: leave one of them out.")
+    return {**settings.hyperparameters, "preference_sampler": settings.preference}
+
+
+def preferences_of(settings: RunSettings, n_objectives: int) -> np.ndarray:
+    """What a run is evaluated for, (P, n_objectives)."""
+    if settings.preference is None:
+        return preference_grid(n_objectives, settings.n_preferences)
+    return check_preference(np.array([settings.preference]), n_objectives).astype(np.float64)
+
+
+def run(settings: RunSettings, callback: BaseCallback | None = None) -> RunResult:
+    """Train, evaluate and write the run's folder.
+
+    :param callback: a further one, which changes no result
+    """
     folder = Path(settings.output)
     _check_empty(folder)
     with prepared(settings) as ready, alone_in(folder):
@@ -152,7 +177,7 @@ def run(settings: RunSettings) -> RunResult:
             for name, front in evaluate_floors(evaluation.eval_env, ready.preferences, settings.n_episodes).items():
                 record.append("floor", policy=name, **front.metrics(ready.reference_point), values=front.values)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-            return _train(settings, ready, record, settings.steps)
+            return _train(settings, ready, record, settings.steps, callback)
 
 
 def _check_empty(folder: Path) -> None:
@@ -160,9 +185,10 @@ def _check_empty(folder: Path) -> None:
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
 
 
-def resume(folder: Path, **running: Any) -> RunResult:
+def resume(folder: Path, callback: BaseCallback | None = None, **running: Any) -> RunResult:
     """Go on with a run that was cut off, from its newest checkpoint.
 
+    :param callback: a further one, which changes no result
     :param running: settings that no result depends on, such as eval_workers
     :raises ValueError: if there is nothing to go on with
     """
@@ -182,14 +208,16 @@ def resume(folder: Path, **running: Any) -> RunResult:
     ):
         name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
         ready.model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]))
-        return _train(settings, ready, record, ready.model.remaining_timesteps)
+        return _train(settings, ready, record, ready.model.remaining_timesteps, callback)
 
 
-def _train(settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int) -> RunResult:
+def _train(
+    settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int, callback: BaseCallback | None
+) -> RunResult:
     folder, model, evaluation = Path(settings.output), ready.model, ready.evaluation
     checkpoints = MombaCheckpointCallback(settings.checkpoint_freq, folder / CHECKPOINTS, settings.keep_checkpoints)
     try:
-        callbacks = CallbackList([evaluation, checkpoints])
+        callbacks = CallbackList([evaluation, checkpoints, *([] if callback is None else [callback])])
         model.learn(steps, callbacks, reset_num_timesteps=model.num_timesteps == 0, progress_bar=settings.progress_bar)
     finally:
         model.save(folder / "model.zip")
@@ -206,7 +234,7 @@ def record_failure(settings: RunSettings, error: str) -> None:
     """A record in the run's folder of a run that died before it could begin one."""
     n_objectives = probe_environment(settings.env, settings.env_kwargs).n_objectives
     reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives)
-    preferences = preference_grid(n_objectives, settings.n_preferences)
+    preferences = preferences_of(settings, n_objectives)
     record = RecordWriter(Path(settings.output) / RECORD_NAME)
     with contextlib.suppress(RuntimeError), record.start(**description(settings, preferences, reference_point, {})):
         raise RuntimeError(error)
@@ -232,5 +260,5 @@ def description(
 def recorded_settings(settings: RunSettings) -> dict[str, Any]:
     """Every setting that a result depends on, defaults included, as JSON holds it."""
     config = {name: value for name, value in asdict(settings).items() if name not in NOT_RECORDED}
-    config["hyperparameters"] = with_defaults(settings.policy, settings.hyperparameters)
+    config["hyperparameters"] = with_defaults(settings.policy, hyperparameters_of(settings))
     return dict(plain(config))

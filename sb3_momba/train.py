@@ -58,6 +58,9 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         "--conf", help=f"yaml file in rl_zoo3's format, or one of the shipped: {', '.join(shipped_configurations())}"
     )
     parser.add_argument("--label", help="the method's name in reports; by default the configuration's")
+    parser.add_argument(
+        "--preference", type=float, nargs="+", help="train and evaluate for this one alone (4.2.4); by default for all"
+    )
     parser.add_argument("--output", help="folder of the run; by default runs/ENV/TIME-SEED")
 
     variant = parser.add_argument_group("variants (Table A.1)")
@@ -128,6 +131,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         n_preferences=given.n_preferences,
         n_episodes=given.n_episodes,
         reference_point=given.reference_point,
+        preference=given.preference,
         objectives=given.objectives,
         eval_workers=given.eval_workers,
         checkpoint_freq=given.checkpoint_freq,
@@ -173,8 +177,8 @@ def command_of(config: dict[str, Any]) -> list[str]:
     for name in ("env", "steps", "seed", "label", "n_envs", "eval_freq", "n_preferences", "n_episodes", "device"):
         if name in ("env", "steps", "seed") or config[name] != usual[name]:
             words += [option(name), str(config[name])]
-    for name in ("reference_point", "objectives"):
-        if config[name] is not None:
+    for name in ("reference_point", "preference", "objectives"):
+        if config.get(name) is not None:
             words += [option(name), *map(str, config[name])]
     if config["subprocesses"]:
         words.append("--subprocesses")
@@ -182,6 +186,8 @@ def command_of(config: dict[str, Any]) -> list[str]:
         words += ["--architecture", {policy: name for name, policy in ARCHITECTURES.items()}[config["policy"]]]
     defaults = flat(plain(with_defaults(config["policy"], {})))
     changed = {name: x for name, x in flat(config["hyperparameters"]).items() if name not in defaults or x != defaults[name]}
+    if config.get("preference") is not None:
+        del changed["preference_sampler"]
     for option_name, values in (("--set", changed), ("--env-kwargs", config["env_kwargs"])):
         for name, value in values.items():
             words += [option_name, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]

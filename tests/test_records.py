@@ -35,8 +35,8 @@ from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy, evaluate_flo
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
 from sb3_momba.records import UNENDED, Record, RecordWriter, find_records, is_cut_off_at_its_start, plain, read_record
-from sb3_momba.runs import NOT_RECORDED, RunSettings, run
-from sb3_momba.train import main
+from sb3_momba.runs import NOT_RECORDED, RunSettings, recorded_settings, run
+from sb3_momba.train import command_of, main, parse
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
 from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
 
@@ -1040,3 +1040,48 @@ def test_a_missing_path_and_a_folder_without_records_are_errors(tmp_path) -> Non
     for paths in ([tmp_path], iter([tmp_path])):
         with pytest.raises(FileNotFoundError, match=re.escape(str(tmp_path))):
             find_records(paths)
+
+
+# ------------------------------------------------------------------------------------------------------- one preference
+
+
+def test_a_run_for_one_preference_trains_and_is_evaluated_for_it_alone(tmp_path) -> None:
+    settings = settings_of(tmp_path / "run", preference=[0.3, 0.7])
+    result = run(settings)
+    record = read_record(result.folder / "record.jsonl")
+    np.testing.assert_allclose(record.preferences, [[0.3, 0.7]], rtol=1e-6)
+    assert record.config["preference"] == [0.3, 0.7]
+    assert record.final_values is not None
+    assert record.final_values.shape == (1, 2)
+    model = MOMBA.load(result.folder / "model.zip")
+    front = evaluate_front(model, settings.env, preferences=[[0.3, 0.7]], n_episodes=settings.n_episodes)
+    np.testing.assert_array_equal(front.values, record.final_values)
+    buffer = MOMBA.resume(result.folder / "checkpoints", settings.env).replay_buffer
+    assert buffer is not None
+    np.testing.assert_allclose(buffer.preferences[: buffer.pos], np.full((buffer.pos, 1, 2), [0.3, 0.7]), rtol=1e-6)
+
+
+def test_one_preference_and_a_sampler_of_others_are_an_error(tmp_path) -> None:
+    settings = settings_of(tmp_path / "run", preference=[0.3, 0.7])
+    settings.hyperparameters["preference_sampler"] = "cone"
+    with pytest.raises(ValueError, match=r"preference=\[0.3, 0.7\] and preference_sampler='cone': leave one"):
+        run(settings)
+    with pytest.raises(ValueError, match="sums to"):
+        run(settings_of(tmp_path / "run", preference=[0.3, 0.3]))
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_command_line_takes_one_preference() -> None:
+    settings = parse(["--env", "MO-Hopper-v4", "--preference", "0.3", "0.7", "--output", "x"])
+    assert settings.preference == [0.3, 0.7]
+    command = command_of(recorded_settings(settings))
+    assert " ".join(command[-3:]) == "--preference 0.3 0.7"
+
+
+def test_a_traceback_is_recorded_with_the_error(tmp_path) -> None:
+    with pytest.raises(RuntimeError), writer_of(tmp_path / "r.jsonl"):
+        raise RuntimeError("diverged")
+    record = read_record(tmp_path / "r.jsonl")
+    assert record.error == "RuntimeError: diverged"
+    assert record.traceback.startswith("Traceback (most recent call last):")
+    assert record.traceback.endswith("RuntimeError: diverged\n")

@@ -147,16 +147,16 @@ def simplex_lattice(n_objectives: int, divisions: int) -> np.ndarray:
 
 @lru_cache
 def _riesz_grids() -> dict[str, np.ndarray]:
-    with resources.files("sb3_momba.envs").joinpath("riesz_100.npz").open("rb") as file, np.load(file) as grids:
+    with resources.files("sb3_momba.envs").joinpath("riesz.npz").open("rb") as file, np.load(file) as grids:
         return dict(grids)
 
 
 def preference_grid(n_objectives: int, n_preferences: int = 100) -> np.ndarray:
     """Equally spaced preferences on the simplex (section 4.1.2).
 
-    Two objectives: `linspace`, exactly n. Three to six: 100 points of least Riesz energy (Blank et al., 2021), computed
-    with pymoo's `get_reference_directions("energy", d, 100, seed=1)`. Any other n: the smallest simplex lattice with at
-    least n points, said in the log.
+    Two objectives: `linspace`, exactly n. Three to six: 100 points of least Riesz energy (Blank et al., 2021), and for three
+    also 50 (section 4.2.4), computed with pymoo's `get_reference_directions("energy", d, n, seed=1)`. Any other n: the
+    smallest simplex lattice with at least n points, said in the log.
 
     :return: float64 (n, n_objectives)
     """
@@ -167,8 +167,8 @@ def preference_grid(n_objectives: int, n_preferences: int = 100) -> np.ndarray:
     if n_objectives == 2:
         first = np.linspace(0, 1, n_preferences) if n_preferences > 1 else np.array([0.5])
         return np.stack([first, 1 - first], axis=1)
-    if n_preferences == 100 and str(n_objectives) in _riesz_grids():
-        return _riesz_grids()[str(n_objectives)].copy()
+    if (size := f"{n_objectives}x{n_preferences}") in _riesz_grids():
+        return _riesz_grids()[size].copy()
     divisions = 1
     while comb(divisions + n_objectives - 1, n_objectives - 1) < n_preferences:
         divisions += 1

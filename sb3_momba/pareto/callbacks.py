@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.registry import copies_of
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_front, probe_environment
@@ -57,6 +57,7 @@ class ParetoEvalCallback(EventCallback):
     :param objectives: names of the picture's axes, n_objectives of them
     :param n_workers: processes that share the episodes of an evaluation
     :param verbose: 1 prints a line for each evaluation
+    :param preferences: to evaluate instead, (P, n_objectives), each on the simplex
     :raises ValueError: for eval_freq or n_workers below 1; when the training starts, for what `check` finds, or an eval_env
         that is the training environment
     """
@@ -77,6 +78,7 @@ class ParetoEvalCallback(EventCallback):
         objectives: list[str] | None = None,
         n_workers: int = 1,
         verbose: int = 0,
+        preferences: ArrayLike | None = None,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
         if eval_freq < 1:
@@ -92,6 +94,7 @@ class ParetoEvalCallback(EventCallback):
             "seed": seed,
             "deterministic": deterministic,
             "n_workers": n_workers,
+            "preferences": preferences,
         }
         self.reference_point = reference_point
         self.log_path = None if log_path is None else Path(log_path)
@@ -132,7 +135,10 @@ class ParetoEvalCallback(EventCallback):
                 raise ValueError(f"{error} Give ParetoEvalCallback an eval_env, such as an id.") from error
         assert self.eval_env is not None
         n_objectives = check_model_fits(model, probe_environment(self.eval_env))
-        preference_grid(n_objectives, self.evaluation_kwargs["n_preferences"])
+        if self.evaluation_kwargs["preferences"] is None:
+            preference_grid(n_objectives, self.evaluation_kwargs["n_preferences"])
+        else:
+            check_preference(np.atleast_2d(self.evaluation_kwargs["preferences"]), n_objectives)
         if self.reference_point is not None:
             hypervolume(np.zeros((1, n_objectives)), self.reference_point)
         if self.objectives is not None and len(self.objectives) != n_objectives:
