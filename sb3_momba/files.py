@@ -103,11 +103,15 @@ def delete_unfinished(path: Path) -> None:
             aside.unlink(missing_ok=True)
 
 
+class FolderInUseError(ValueError):
+    """Another process writes into a folder."""
+
+
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """The only process that writes into a folder, which is made if need be. (Not watched over on Windows.)
 
-    :raises ValueError: if another one does
+    :raises FolderInUseError: if another one does
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "w") as lock:
@@ -115,7 +119,9 @@ def alone_in(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise ValueError(f"Another process writes into {folder}: wait for it, or choose another folder.") from error
+                raise FolderInUseError(
+                    f"Another process writes into {folder}: wait for it, or choose another folder."
+                ) from error
         yield
 
 

@@ -155,3 +155,7 @@ def assert_same_tree(ours: Any, theirs: Any, place: str = "tree") -> None:
         assert our.tobytes() == their.tobytes(), place
     else:
         assert ours == theirs or (ours != ours and theirs != theirs), f"{place}: {ours!r} and {theirs!r}"
+
+
+# Its training fails, its evaluations, which have a copy for each episode, do not get that far.
+gym.register("diverging-v0", StubEnv, kwargs={"rewards": {200: np.array([np.nan, 1.0])}})

@@ -22,7 +22,8 @@ from scipy.spatial import ConvexHull
 from sb3_momba import records, runs, train
 from sb3_momba.benchmark import grid, speed
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.grid import Cell, has_to_run, make_cells, run_grid
+from sb3_momba.benchmark.cells import Cell, has_to_run, make_cells
+from sb3_momba.benchmark.grid import run_grid
 from sb3_momba.benchmark.report import median_run, write_report
 from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
 from sb3_momba.benchmark.statistics import Estimate
@@ -1228,7 +1229,7 @@ def test_what_ended_is_not_run_again_and_what_was_cut_off_is(training, tmp_path)
     failed = (tmp_path / cells[1].name / "record.jsonl").read_bytes()
 
     second = training()
-    assert run_grid(cells, tmp_path, processes=2) == [cells[1].name, cells[3].name]
+    assert list(run_grid(cells, tmp_path, processes=2)) == [cells[1].name, cells[3].name]
     assert second.seeds == [2]
     assert "it did not start: does not start" in str(read_record(tmp_path / cells[3].name / "record.jsonl").error)
     assert (tmp_path / cells[1].name / "record.jsonl").read_bytes() == failed
@@ -1238,7 +1239,7 @@ def test_what_ended_is_not_run_again_and_what_was_cut_off_is(training, tmp_path)
     assert len(run_grid(cells, tmp_path)) == 2
     assert third.seeds == []
     fourth = training()
-    assert run_grid(cells, tmp_path, retry_failed=True) == []
+    assert run_grid(cells, tmp_path, retry_failed=True) == {}
     assert sorted(fourth.seeds) == [1, 3]
 
 

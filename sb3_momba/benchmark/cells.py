@@ -1,0 +1,298 @@
+"""What a grid of runs consists of: every configuration on every environment with every seed, and which of them have ended.
+
+A grid is a yaml file:
+
+    variants: [momba, capql]         # shipped configurations, or yaml files
+    tasks: [MO-Hopper-v4]            # environment ids
+    seeds: 10                        # they are 0 to 9
+    options: {eval_freq: 20_000}     # of `python -m sb3_momba.train`; none by default
+    auto_ent_coef: 0.01              # where variants that learn alpha start it; by default their own
+    fixed_preferences: {2: 20}       # by number of objectives: one run for each of so many preferences (section 4.2.4)
+"""
+
+import argparse
+import json
+import shutil
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+from textwrap import indent
+from typing import Any
+
+import yaml
+
+from sb3_momba.benchmark.results import flat
+from sb3_momba.checkpoints.folders import newest
+from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.files import LOCK, FileFormatError
+from sb3_momba.pareto.evaluation import probe_environment
+from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
+from sb3_momba.runs import CHECKPOINTS, RunSettings, prepared, recorded_settings
+from sb3_momba.settings import check_names, nearest, parse_ent_coef
+from sb3_momba.train import parse
+from sb3_momba.zoo.configuration import literal, read_configuration, with_later_settings
+
+SHIPPED = resources.files("sb3_momba.benchmark") / "grids"
+FIXED_PREFERENCE = "fixed_preference"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run.
+
+    :param conf: yaml file or name of a shipped configuration
+    :param options: further ones of `python -m sb3_momba.train`
+    :param method: first part of the cell's name; by default the configuration's
+    """
+
+    conf: str
+    env: str
+    seed: int
+    options: tuple[str, ...] = field(default=())
+    method: str = ""
+
+    @property
+    def name(self) -> str:
+        return f"{self.method or Path(self.conf).stem}/{self.env}/{self.seed}"
+
+    def arguments(self, folder: Path) -> list[str]:
+        """Of `python -m sb3_momba.train`."""
+        where = ["--conf", self.conf, "--env", self.env, "--seed", str(self.seed), "--output", str(folder)]
+        return [*self.options, *where, "--no-progress-bar"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A yaml file's entries; see the module's docstring."""
+
+    variants: list[str]
+    tasks: list[str]
+    seeds: int
+    options: dict[str, Any] = field(default_factory=dict)
+    auto_ent_coef: float | None = None
+    fixed_preferences: dict[int, int] = field(default_factory=dict)
+
+
+def shipped_grids() -> list[str]:
+    """Names of the grids that come with the package."""
+    return sorted(file.name.removesuffix(".yml") for file in SHIPPED.iterdir() if file.name.endswith(".yml"))
+
+
+def read_grid(name: str) -> Grid:
+    """
+    :param name: a yaml file, or the name of a shipped grid
+    :raises ValueError: for neither, for what is no yaml, and for entries that a grid does not have, lacks or cannot take
+    """
+    file = SHIPPED / f"{name}.yml" if name in shipped_grids() else Path(name)
+    if not file.is_file():
+        raise ValueError(f"{name!r} is neither a yaml file nor a shipped grid{nearest(name, shipped_grids())}")
+    try:
+        entries = literal(yaml.safe_load(file.read_text()))
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {' '.join(str(error).split())}") from error
+    check_names(name, entries, [entry.name for entry in fields(Grid)], "A grid has no entry")
+    kinds = {"variants": list, "tasks": list, "seeds": int, "options": dict, "fixed_preferences": dict}
+    for entry, kind in kinds.items():
+        if entry in ("variants", "tasks", "seeds") and entry not in entries:
+            raise ValueError(f"{name} has no {entry}: a grid needs variants, tasks and seeds.")
+        if entry in entries and not isinstance(entries[entry], kind):
+            raise ValueError(f"{name}: {entry} is {entries[entry]!r}; it must be a {kind.__name__}.")
+    return Grid(**entries)
+
+
+def as_arguments(options: Mapping[str, Any]) -> list[str]:
+    """{"steps": 300, "set": {"gamma": 0.9}, "her": True} -> --steps 300 --set gamma=0.9 --her"""
+    words: list[str] = []
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(value, dict):
+            for key, item in value.items():
+                words += [option, f"{key}={item if isinstance(item, str) else json.dumps(item)}"]
+        elif isinstance(value, list):
+            words += [option, *map(str, value)]
+        else:
+            words += [option] if value is True else [option, str(value)]
+    return words
+
+
+def make_cells(
+    confs: Sequence[str],
+    envs: Sequence[str],
+    seeds: int,
+    options: Sequence[str] = (),
+    auto_ent_coef: float | None = None,
+    fixed_preferences: Mapping[int, int] | None = None,
+) -> list[Cell]:
+    """Seeds vary slowest, so that whatever is finished compares all methods.
+
+    :param seeds: how many
+    :param auto_ent_coef: where configurations that learn alpha start it, all alike
+    :param fixed_preferences: by number of objectives how many preferences, each with a run of its own
+    :raises ValueError: for a configuration that does not exist, or two of one name
+    """
+    for option in ("--seed", "--output"):
+        if any(given.split("=")[0] == option for given in options):
+            raise ValueError(f"{option} is the grid's own for each run: give --seeds and the grid's --output.")
+    if seeds < 1:
+        raise ValueError(f"seeds={seeds}: at least one is needed.")
+    cells: list[Cell] = []
+    for seed in range(seeds):
+        for env in dict.fromkeys(envs):
+            for conf in dict.fromkeys(confs):
+                learned, _ = parse_ent_coef(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto"))
+                start = ("--ent-coef", f"auto_{auto_ent_coef}") if auto_ent_coef is not None and learned else ()
+                cell = Cell(conf, env, seed, (*start, *options))
+                cells += _with_fixed_preferences(cell, fixed_preferences) if fixed_preferences else [cell]
+    return merged(cells)
+
+
+def _with_fixed_preferences(cell: Cell, numbers: Mapping[int, int]) -> list[Cell]:
+    n_objectives = probe_environment(cell.env).n_objectives
+    if n_objectives not in numbers:
+        raise ValueError(f"fixed_preferences={dict(numbers)}: {cell.env} has {n_objectives} objectives; say how many for it.")
+    conf = "" if Path(cell.conf).stem == "momba" else f"-{Path(cell.conf).stem}"
+    return [
+        Cell(
+            cell.conf,
+            cell.env,
+            cell.seed,
+            (*cell.options, "--label", f"{FIXED_PREFERENCE}{conf}", "--preference", *map(str, preference)),
+            f"{FIXED_PREFERENCE}{conf}-{number:02}",
+        )
+        for number, preference in enumerate(preference_grid(n_objectives, numbers[n_objectives]).tolist())
+    ]
+
+
+def merged(cells: Iterable[Cell]) -> list[Cell]:
+    """Each cell once.
+
+    :raises ValueError: for two different ones of one name
+    """
+    by_name: dict[str, Cell] = {}
+    for cell in cells:
+        other = by_name.setdefault(cell.name, cell)
+        if other.conf != cell.conf:
+            raise ValueError(f"{other.conf} and {cell.conf} have one name, {cell.name}: rename one of them.")
+        if other != cell:
+            raise ValueError(
+                f"{cell.name} is asked for with {' '.join(other.options) or 'no options'} and with "
+                f"{' '.join(cell.options) or 'no options'}: run these grids in folders of their own."
+            )
+    return list(by_name.values())
+
+
+def checked(cells: Sequence[Cell], output: Path) -> dict[str, RunSettings]:
+    """The settings of each cell, by its name.
+
+    :raises ValueError: for settings that cannot be
+    :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
+    """
+    settings = {cell.name: parse(cell.arguments(output / cell.name)) for cell in cells}
+    for one in {(cell.conf, cell.env, cell.method): settings[cell.name] for cell in cells}.values():
+        with prepared(one):
+            pass
+    return settings
+
+
+def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) -> bool:
+    """Whether a cell never ran or was cut off.
+
+    :raises ValueError: if its folder holds anything but a run with these settings
+    """
+    record = folder / FILE_NAME
+    if not record.exists() or is_cut_off_at_its_start(record):
+        if folder.exists() and (not folder.is_dir() or any(file.name not in (FILE_NAME, LOCK) for file in folder.iterdir())):
+            raise ValueError(f"{folder} holds something else than a run: choose another --output.")
+        return True
+    found = read_record(record)
+    theirs, ours = flat(with_later_settings(found.config)), flat(recorded_settings(settings))
+    differing = sorted(name for name in {*theirs, *ours} if theirs.get(name) != ours.get(name))
+    if differing:
+        raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
+    return found.error == UNENDED or (retry_failed and found.error is not None)
+
+
+def goes_on(folder: Path) -> bool:
+    """Whether a cell that has to run goes on from a checkpoint. If not, whatever is left of it is removed."""
+    if _has_checkpoint(folder):
+        return True
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return False
+
+
+def _has_checkpoint(folder: Path) -> bool:
+    """Whether a run was cut off, and left a checkpoint that is whole."""
+    record = folder / FILE_NAME
+    if not record.exists() or is_cut_off_at_its_start(record) or read_record(record).error != UNENDED:
+        return False
+    try:
+        newest(folder / CHECKPOINTS)
+    except (FileNotFoundError, FileFormatError):
+        return False
+    return True
+
+
+def log_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.log")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Those that say what a grid consists of; see `cells_of`."""
+    parser.add_argument("--grid", nargs="+", default=[], help=f"yaml files, or shipped: {', '.join(shipped_grids())}")
+    parser.add_argument("--conf", nargs="+", default=[], help="instead: shipped configurations or yaml files")
+    parser.add_argument("--env", nargs="+", default=[], help="environment ids; by default the grid's")
+    parser.add_argument("--seeds", type=int, help="how many, 0, 1, ...; by default the grid's")
+    parser.add_argument("--output", type=Path, required=True, help="folder of the run folders")
+    parser.add_argument("--retry-failed", action="store_true", help="run again what failed")
+    parser.add_argument(
+        "--auto-ent-coef", type=float, help="where every configuration that learns alpha starts it; 0.01 below 200,000 steps"
+    )
+    parser.epilog = "Every other option is handed to python -m sb3_momba.train, such as --steps 3e4."
+
+
+def cells_of(given: argparse.Namespace, options: Sequence[str]) -> list[Cell]:
+    """What the command line asks for; its own words win over a grid's.
+
+    :raises ValueError: for neither grids nor configurations, or both
+    """
+    if bool(given.grid) == bool(given.conf):
+        raise ValueError("Give either --grid, or --conf with --env and --seeds.")
+    if given.conf and not (given.env and given.seeds is not None):
+        raise ValueError("--conf needs --env and --seeds.")
+    grids = [read_grid(name) for name in given.grid] or [Grid(given.conf, given.env, given.seeds)]
+    cells: list[Cell] = []
+    for grid in grids:
+        cells += make_cells(
+            grid.variants,
+            given.env or grid.tasks,
+            grid.seeds if given.seeds is None else given.seeds,
+            [*as_arguments(grid.options), *options],
+            grid.auto_ent_coef if given.auto_ent_coef is None else given.auto_ent_coef,
+            grid.fixed_preferences,
+        )
+    return merged(cells)
+
+
+def failed(cells: Sequence[Cell], output: Path) -> dict[str, str]:
+    """The cells that did not finish, by name, each with its traceback or, where it left none, its error."""
+    found = {}
+    for cell in cells:
+        path = output / cell.name / FILE_NAME
+        if not path.exists() or is_cut_off_at_its_start(path):
+            found[cell.name] = "no record: it never began"
+        elif (record := read_record(path)).error is not None:
+            found[cell.name] = (record.traceback or record.error or "").rstrip()
+    return found
+
+
+def end_with_failures(failures: Mapping[str, str], output: Path) -> None:
+    """Print what failed, by name, and leave with an error if anything did."""
+    for name, text in failures.items():
+        print(f"\n{name}\n{indent(text, '    ')}", file=sys.stderr)
+    if failures:
+        names = ", ".join(failures)
+        sys.exit(f"error: {len(failures)} runs failed ({names}); their logs lie beside their folders in {output}.")

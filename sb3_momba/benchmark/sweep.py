@@ -1,0 +1,91 @@
+"""A grid of runs on Ray: on this machine, or on all those of a cluster.
+
+What must survive lies in the runs' own folders: their records and checkpoints. So a run whose process, node or sweep is killed
+goes on from its newest checkpoint, and its record is that of a run that nothing happened to. All nodes need the output folder
+under one path, with file locks.
+"""
+
+import argparse
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from sb3_momba.benchmark import cells
+from sb3_momba.benchmark.cells import Cell
+from sb3_momba.files import alone_in
+
+
+def run_sweep(
+    grid: Sequence[Cell],
+    output: Path,
+    address: str | None = None,
+    workers: int | None = None,
+    threads: int = 1,
+    gpus: float = 0.0,
+    max_failures: int = 10,
+    retry_failed: bool = False,
+) -> dict[str, str]:
+    """Run what has not ended yet; the names of the runs that failed, now or before, each with what is known of it.
+
+    :param address: of a Ray cluster, "host:port" or "auto" for the one that this machine is part of; None: this machine alone
+    :param workers: runs side by side; by default as many as there are processors for
+    :param threads: processors of each run
+    :param gpus: share of a GPU of each run (untested)
+    :param max_failures: how often a run may lose its process before this sweep gives it up
+    :param retry_failed: run again what failed
+    :raises ImportError: without Ray
+    :raises ValueError: for settings that cannot be, a folder that holds something else or where another grid runs, before
+        anything runs
+    :raises ConnectionError: if no cluster answers
+    """
+    try:
+        from sb3_momba.benchmark import trials
+    except ImportError as error:
+        raise ImportError(f'A sweep needs Ray: pip install "sb3-momba[benchmark]" ({error}).') from error
+    for name, value, least in (
+        ("workers", workers, 1),
+        ("threads", threads, 1),
+        ("gpus", gpus, 0),
+        ("max_failures", max_failures, 0),
+    ):
+        if value is not None and value < least:
+            raise ValueError(f"{name}={value}: it must be at least {least}.")
+    if workers is None and address is None:
+        workers = max(1, (os.cpu_count() or 1) // threads)
+    output = output.resolve()
+    settings = cells.checked(grid, output)
+    with alone_in(output):
+        waiting = [cell.name for cell in grid if cells.has_to_run(output / cell.name, settings[cell.name], retry_failed)]
+        said = {}
+        if waiting:
+            with trials.cluster(address, (workers or 1) * threads, threads):
+                asked_for = {name: asdict(settings[name]) for name in waiting}
+                said = trials.run_trials(asked_for, output, workers, threads, gpus, max_failures)
+        failed = cells.failed(grid, output)
+    return {name: said.get(name, error) for name, error in failed.items()}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    cells.add_arguments(parser)
+    parser.add_argument("--address", help='of a Ray cluster, "host:port" or "auto"; by default this machine alone')
+    parser.add_argument("--workers", type=int, help="runs side by side; by default as many as there are processors for")
+    parser.add_argument("--threads", type=int, default=1, help="processors of each run")
+    parser.add_argument("--gpus", type=float, default=0.0, help="share of a GPU of each run")
+    parser.add_argument("--max-failures", type=int, default=10, help="how often a run may lose its process")
+
+
+def main(given: argparse.Namespace, options: Sequence[str]) -> None:
+    logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
+    failures = run_sweep(
+        cells.cells_of(given, options),
+        given.output,
+        given.address,
+        given.workers,
+        given.threads,
+        given.gpus,
+        given.max_failures,
+        given.retry_failed,
+    )
+    cells.end_with_failures(failures, given.output)

@@ -1,0 +1,225 @@
+"""The runs of a sweep as trials of Ray Tune, each in a process of its own. The only module that imports Ray."""
+
+import contextlib
+import io
+import logging
+import os
+import socket
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+# Before Ray is imported: no statistics are sent, Ctrl-C ends the sweep, trials need no logs beside the runs' own.
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("TUNE_DISABLE_SIGINT_HANDLER", "1")
+os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")
+
+import ray
+from ray import tune
+from ray.tune.experiment import Trial
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_momba.benchmark import cells
+from sb3_momba.files import LOCK, FolderInUseError, alone_in
+from sb3_momba.runs import RunSettings, resume, run
+
+STATE = ".tune"  # Ray Tune's own files, in the output folder; nothing is read from them
+OBJECT_STORE_BYTES = 100_000_000  # trials exchange a few numbers
+SECONDS_BETWEEN_REPORTS = 2.0
+SECONDS_FOR_AN_ADDRESS = 10.0
+SECONDS_FOR_A_LOCK = 120.0  # in which the processes of a node that was lost notice it and end
+
+logger = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def cluster(address: str | None, processors: int, threads: int) -> Iterator[None]:
+    """Ray, on this machine alone with so many processors or on a cluster.
+
+    :raises ConnectionError: if no cluster answers
+    """
+    arguments: dict[str, Any] = {"address": address}
+    if address is None:
+        arguments = {"address": "local", "num_cpus": processors, "object_store_memory": OBJECT_STORE_BYTES}
+        arguments["include_dashboard"] = False
+    elif address != "auto":
+        _check_answers(address)
+    try:
+        ray.init(
+            **arguments,
+            runtime_env={"env_vars": {"OMP_NUM_THREADS": str(threads)}},
+            log_to_driver=False,
+            logging_level=logging.WARNING,
+        )
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ConnectionError(f"Ray at {address!r} cannot be reached: {error}") from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _check_answers(address: str) -> None:
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal():
+        raise ValueError(f'address={address!r}: give "host:port" of a Ray cluster, or "auto".')
+    try:
+        socket.create_connection((host, int(port)), SECONDS_FOR_AN_ADDRESS).close()
+    except (OSError, OverflowError) as error:
+        raise ConnectionError(
+            f"No Ray cluster answers at {address}: {error}. Start one there with `ray start --head`."
+        ) from error
+
+
+def run_trials(
+    settings: Mapping[str, dict[str, Any]],
+    output: Path,
+    workers: int | None,
+    threads: int,
+    gpus: float,
+    max_failures: int,
+) -> dict[str, str]:
+    """Run each of these, by name; what those that did not finish have said last."""
+    resources: dict[str, float] = {"cpu": threads, **({"gpu": gpus} if gpus else {})}
+    trials = [{"name": name, "output": str(output), "settings": one} for name, one in settings.items()]
+    watch = Watch(len(trials))
+    for name in ("ray.tune", "ray.train"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # Lost processes are told of here.
+    tuner = tune.Tuner(
+        tune.with_resources(train_cell, resources),
+        param_space={"cell": tune.grid_search(trials)},
+        tune_config=tune.TuneConfig(max_concurrent_trials=workers, trial_dirname_creator=lambda trial: trial.trial_id),
+        run_config=tune.RunConfig(
+            name=STATE,
+            storage_path=str(output),
+            failure_config=tune.FailureConfig(max_failures=max_failures),
+            callbacks=[watch],
+            verbose=0,
+        ),
+    )
+    console = Console(stderr=True)
+    with (
+        Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False) as live,
+        contextlib.redirect_stdout(io.StringIO()),  # Ray Tune's own tables
+    ):
+        watch.live = live if console.is_terminal else None
+        tuner.fit()
+    return watch.errors
+
+
+def train_cell(config: dict[str, Any]) -> None:
+    """One trial. What its training raises ends it; only the death of its process, which raises nothing, lets it begin again."""
+    cell = config["cell"]
+    settings = RunSettings(**{**cell["settings"], "progress_bar": False})
+    folder = Path(settings.output)
+    tune.report({"steps": 0})
+    try:
+        if not (Path(cell["output"]) / LOCK).exists():
+            raise FileNotFoundError(
+                f"{socket.gethostname()} does not see {cell['output']}: choose an --output that all nodes share."
+            )
+        _wait_until_free(folder)
+        goes_on = cells.goes_on(folder)
+        with (
+            open(cells.log_of(folder), "a" if goes_on else "w", buffering=1) as log,
+            contextlib.redirect_stdout(log),
+            contextlib.redirect_stderr(log),
+        ):
+            if goes_on:
+                resume(folder, Progress(), progress_bar=False)
+            else:
+                run(settings, Progress())
+    except Exception:
+        tune.report({"error": traceback.format_exc()})
+
+
+def _wait_until_free(folder: Path) -> None:
+    """Until the process that has lost this run has ended.
+
+    :raises FolderInUseError: if it does not
+    """
+    until = time.monotonic() + SECONDS_FOR_A_LOCK
+    while True:
+        try:
+            with alone_in(folder):
+                return
+        except FolderInUseError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(1)
+
+
+class Progress(BaseCallback):
+    """Tells Ray Tune how far a run is."""
+
+    def _on_training_start(self) -> None:
+        self.next_report = 0.0
+
+    def _on_step(self) -> bool:
+        if time.monotonic() >= self.next_report:
+            tune.report({"steps": self.num_timesteps})
+            self.next_report = time.monotonic() + SECONDS_BETWEEN_REPORTS
+        return True
+
+
+class Watch(tune.Callback):
+    """What runs where and how far: a live table on a terminal, lines in the log elsewhere.
+
+    :param n_trials: how many there are
+    """
+
+    def __init__(self, n_trials: int):
+        self.n_trials = n_trials
+        self.errors: dict[str, str] = {}
+        self.n_ended = 0
+        self.live: Live | None = None  # Ray Tune stores its callbacks, which a live table cannot be
+
+    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        self._say(f"{name_of(trial)} {'starts' if trial.num_failures == 0 else 'starts again'}")
+
+    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        self._say(f"{name_of(trial)} has lost its process ({trial.num_failures} times)")
+
+    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        self._end(trial, trial.last_result.get("error"))
+
+    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        self._end(trial, f"its process was lost {trial.num_failures} times, the last time by:\n{trial.get_error()}")
+
+    def _end(self, trial: Trial, error: str | None) -> None:
+        self.n_ended += 1
+        if error is not None:
+            self.errors[name_of(trial)] = error.rstrip()
+        self._say(f"{name_of(trial)} {'finished' if error is None else 'failed: ' + error.rstrip().splitlines()[-1]}")
+
+    def _say(self, line: str) -> None:
+        if self.live is None:
+            logger.info("%s", line)
+        else:
+            self.live.console.print(line, markup=False, highlight=False)
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        if self.live is not None:
+            self.live.update(self.table(trials), refresh=True)
+
+    def table(self, trials: Sequence[Trial]) -> Table:
+        """Of the runs that have a process now."""
+        table = Table(title=f"{self.n_ended} of {self.n_trials} runs have ended, {len(self.errors)} failed")
+        for column in ("run", "node", "process", "steps", "of", "processes lost"):
+            table.add_column(column, justify="left" if column in ("run", "node") else "right")
+        for trial in trials:
+            if trial.status == Trial.RUNNING:
+                result = trial.last_result
+                where = (str(result.get("node_ip", "")), str(result.get("pid", "")))
+                steps = trial.config["cell"]["settings"]["steps"]
+                table.add_row(name_of(trial), *where, f"{result.get('steps', 0):,}", f"{steps:,}", str(trial.num_failures))
+        return table
+
+
+def name_of(trial: Trial) -> str:
+    return str(trial.config["cell"]["name"])

@@ -1,0 +1,173 @@
+"""Grids as yaml: which runs they ask for, and what they refuse."""
+
+import re
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_momba import train
+from sb3_momba.benchmark import cells
+from sb3_momba.benchmark.cells import Cell, as_arguments, cells_of, make_cells, merged, read_grid, shipped_grids
+from sb3_momba.envs.pgmorl import TASKS
+from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.zoo.configuration import read_configuration, with_defaults
+
+MINE = {"variants": ["momba", "capql"], "tasks": ["MO-Hopper-v4", "MO-Ant-v4"], "seeds": 2}
+NOTHING = {"grid": [], "conf": [], "env": [], "seeds": None, "auto_ent_coef": None}
+
+
+def written(folder: Path, **entries: Any) -> str:
+    path = folder / "mine.yml"
+    path.write_text(yaml.safe_dump({**MINE, **entries}))
+    return str(path)
+
+
+def asked_for(*options: str, **given: Any) -> list[Cell]:
+    return cells_of(Namespace(**{**NOTHING, **given}), options)
+
+
+def test_a_grid_is_every_variant_on_every_task_with_every_seed(tmp_path) -> None:
+    found = asked_for(grid=[written(tmp_path)])
+    assert found == make_cells(MINE["variants"], MINE["tasks"], 2)
+    assert len(found) == 8
+
+
+def test_the_command_line_wins_over_a_grid(tmp_path) -> None:
+    grid = written(tmp_path, options={"steps": 500, "n_episodes": 2}, auto_ent_coef=0.05)
+    found = asked_for("--steps", "300", grid=[grid], env=["MO-Swimmer-v4"], seeds=1, auto_ent_coef=0.01)
+    assert [cell.name for cell in found] == ["momba/MO-Swimmer-v4/0", "capql/MO-Swimmer-v4/0"]
+    settings = train.parse(found[0].arguments(tmp_path))
+    assert (settings.steps, settings.n_episodes, settings.hyperparameters["ent_coef"]) == (300, 2, "auto_0.01")
+
+
+def test_options_are_words_of_the_training(tmp_path) -> None:
+    options = {"steps": "3e4", "her": True, "set": {"gamma": 0.9, "policy_kwargs.support": [-1, 1]}, "reference_point": [-1, 0]}
+    words = ["--steps", "3e4", "--her", "--set", "gamma=0.9", "--set"]
+    assert as_arguments(options) == [*words, "policy_kwargs.support=[-1, 1]", "--reference-point", "-1", "0"]
+    (cell, *_) = asked_for(grid=[written(tmp_path, options=options)])
+    settings = train.parse(cell.arguments(tmp_path))
+    assert (settings.steps, settings.reference_point) == (30_000, [-1, 0])
+    assert settings.hyperparameters["gamma"] == 0.9
+    assert settings.hyperparameters["policy_kwargs"]["support"] == [-1, 1]
+
+
+def test_what_two_grids_share_is_run_once() -> None:
+    several = asked_for(grid=["value_representation", "normalization"], env=["MO-Hopper-v4"], seeds=1)
+    assert [cell.name for cell in several].count("momba/MO-Hopper-v4/0") == 1
+    assert len(several) == 8 + 8 - 1
+
+
+def test_grids_that_ask_for_one_run_in_two_ways_are_refused(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    grids = [written(tmp_path, options={"steps": 5}), written(tmp_path / "b", options={"steps": 6})]
+    with pytest.raises(ValueError, match=r"momba/MO-Hopper-v4/0 is asked for with --steps 5 and with --steps 6: run these"):
+        asked_for(grid=grids)
+
+
+def test_runs_for_one_preference_each(tmp_path) -> None:
+    grid = {"tasks": ["MO-Hopper-v4", "MO-Hopper-3obj-v4"], "variants": ["momba"], "seeds": 1}
+    found = asked_for(grid=[written(tmp_path, **grid, fixed_preferences={2: 4, 3: 6})])
+    assert [cell.name for cell in found[:4]] == [f"fixed_preference-0{n}/MO-Hopper-v4/0" for n in range(4)]
+    assert len(found) == 4 + 6
+    settings = [train.parse(cell.arguments(tmp_path)) for cell in found]
+    assert {one.label for one in settings} == {"fixed_preference"}
+    np.testing.assert_allclose([one.preference for one in settings[:4]], preference_grid(2, 4))
+    np.testing.assert_allclose([one.preference for one in settings[4:]], preference_grid(3, 6))
+
+
+def test_a_number_of_objectives_without_preferences_is_an_error(tmp_path) -> None:
+    grid = written(tmp_path, tasks=["MO-Hopper-3obj-v4"], fixed_preferences={2: 20})
+    with pytest.raises(ValueError, match=r"fixed_preferences=\{2: 20\}: MO-Hopper-3obj-v4 has 3 objectives"):
+        asked_for(grid=[grid])
+
+
+BAD = {
+    "an entry that there is not": ({"task": []}, "A grid has no entry 'task': did you mean 'tasks'"),
+    "seeds that are no number": ({"seeds": "ten"}, "seeds is 'ten'; it must be a int"),
+    "no seeds": ({"seeds": 0}, "seeds=0: at least one"),
+    "variants that are no list": ({"variants": "momba"}, "variants is 'momba'; it must be a list"),
+    "options that are no mapping": ({"options": ["--steps"]}, "options is"),
+    "an option that is the grid's own": ({"options": {"seed": 3}}, "--seed is the grid's own"),
+    "a variant that there is not": ({"variants": ["mombo"]}, "did you mean 'momba'"),
+}
+
+
+@pytest.mark.parametrize(("entries", "said"), BAD.values(), ids=BAD)
+def test_what_is_no_grid_is_an_error(tmp_path, entries: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        asked_for(grid=[written(tmp_path, **entries)])
+
+
+def test_what_is_missing_is_named(tmp_path) -> None:
+    path = tmp_path / "mine.yml"
+    path.write_text("variants: [momba]\ntasks: [MO-Ant-v4]\n")
+    with pytest.raises(ValueError, match="has no seeds"):
+        read_grid(str(path))
+    path.write_text("- momba\n")
+    with pytest.raises(ValueError, match=r"mine\.yml"):
+        read_grid(str(path))
+    path.write_text("variants: [momba\n")
+    with pytest.raises(ValueError, match="is not valid yaml"):
+        read_grid(str(path))
+    with pytest.raises(ValueError, match="did you mean 'conditioning'"):
+        read_grid("conditionin")
+
+
+@pytest.mark.parametrize(
+    "given", [{}, {"grid": ["utd"], "conf": ["momba"]}, {"conf": ["momba"]}, {"conf": ["momba"], "env": ["MO-Ant-v4"]}], ids=str
+)
+def test_grids_or_configurations_must_be_given(given: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="--conf"):
+        asked_for(**given)
+
+
+def test_no_cells_are_no_cells() -> None:
+    assert merged([]) == []
+
+
+# ------------------------------------------------------------------------------------------------------- shipped grids
+
+
+@pytest.mark.parametrize("name", shipped_grids())
+def test_shipped_grids_are_of_the_seven_tasks(name: str) -> None:
+    grid = read_grid(name)
+    assert sorted(grid.tasks) == sorted(TASKS)
+    assert len(set(grid.variants)) == len(grid.variants)
+    for conf in grid.variants:
+        read_configuration(conf, grid.tasks[0])
+
+
+def test_no_two_variants_of_the_shipped_grids_are_one_method() -> None:
+    """What would be trained twice is Momba's under its own name."""
+    seen: dict[str, str] = {}
+    for name in shipped_grids():
+        for conf in read_grid(name).variants:
+            found = read_configuration(conf, "MO-Hopper-v4")
+            what = repr((found.policy, sorted(with_defaults(found.policy, found.hyperparameters).items(), key=str)))
+            assert seen.setdefault(what, conf) == conf
+
+
+def test_the_sizes_of_chapter_4() -> None:
+    """Sections 4.3.1 to 4.3.5 and 4.4: combinations and seeds."""
+    sizes = {name: (len(read_grid(name).variants), read_grid(name).seeds) for name in shipped_grids()}
+    assert sizes["value_representation"] == (8, 10)
+    assert sizes["critic_scaling"] == (16, 10)
+    assert sizes["normalization"] == (8, 10)
+    assert sizes["conditioning"] == (4, 5)
+    assert sizes["utd"] == (4, 10)
+    assert sizes["her_par"] == (4, 10)
+    fixed = asked_for(grid=["fixed_preference"])
+    assert len(fixed) == 6 * 20 + 50
+
+
+def test_grids_are_named_in_the_help(capsys) -> None:
+    from sb3_momba.benchmark.__main__ import main
+
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert all(name in said.replace("- ", "-") for name in cells.shipped_grids())
