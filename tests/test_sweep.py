@@ -4,6 +4,7 @@ import contextlib
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -100,6 +101,7 @@ def test_what_is_killed_goes_on_and_its_record_is_that_of_a_run_that_nothing_hap
             wait_until(lambda: not processes_of_trials(), 60)
             unfinished = [run for run in RUNS if not ended(stormy / run)]
             assert unfinished, "all of it came too late"
+            shutil.rmtree(stormy / unfinished[0] / "checkpoints", ignore_errors=True)
             again = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False, timeout=300)
         finally:
             driver.kill()
@@ -234,6 +236,14 @@ def test_bad_input_ends_with_one_line_of_error(tmp_path, capsys, monkeypatch, op
         main(["sweep", "--conf", "momba", "--env", ENV, "--seeds", "1", "--output", str(tmp_path / "sweep"), *options])
     assert said in (str(stop.value) if isinstance(stop.value.code, str) else capsys.readouterr().err)
     assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def test_what_no_node_can_run_is_refused(tmp_path, monkeypatch) -> None:
+    nodes = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": False, "Resources": {"CPU": 16.0, "GPU": 1.0}}]
+    monkeypatch.setattr(trials.ray, "nodes", lambda: nodes)
+    for threads, gpus in ((8, 0.0), (1, 0.5)):
+        with pytest.raises(ValueError, match=f"threads={threads}, gpus={gpus}: no node has as many"):
+            trials.run_trials({"a": {}}, tmp_path, None, threads, gpus, 0)
 
 
 def test_two_sweeps_on_one_folder_are_refused(tmp_path) -> None:

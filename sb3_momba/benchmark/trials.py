@@ -84,8 +84,14 @@ def run_trials(
     gpus: float,
     max_failures: int,
 ) -> dict[str, str]:
-    """Run each of these, by name; what those that did not finish have said last."""
-    resources: dict[str, float] = {"cpu": threads, **({"gpu": gpus} if gpus else {})}
+    """Run each of these, by name; what those that did not finish have said last.
+
+    :raises ValueError: if no node has the processors that a run needs
+    """
+    resources: dict[str, float] = {"CPU": threads, **({"GPU": gpus} if gpus else {})}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    if not any(all(node.get(name, 0) >= amount for name, amount in resources.items()) for node in nodes):
+        raise ValueError(f"threads={threads}, gpus={gpus}: no node has as many for one run; choose less, or add one.")
     trials = [{"name": name, "output": str(output), "settings": one} for name, one in settings.items()]
     watch = Watch(len(trials))
     for name in ("ray.tune", "ray.train"):
