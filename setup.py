@@ -17,7 +17,15 @@ setup(
     license="MIT",
     license_files=["LICENSE"],
     packages=find_packages(include=["sb3_momba", "sb3_momba.*"]),
-    package_data={"sb3_momba": ["py.typed", "envs/riesz.npz", "zoo/hyperparams/*.yml", "benchmark/grids/*.yml"]},
+    package_data={
+        "sb3_momba": [
+            "py.typed",
+            "envs/riesz.npz",
+            "zoo/hyperparams/*.yml",
+            "benchmark/grids/*.yml",
+            "benchmark/chapter4/thesis.yml",
+        ],
+    },
     python_requires=">=3.10",
     install_requires=[
         "stable-baselines3>=2.9,<3",

@@ -1,5 +1,4 @@
-"""`python -m sb3_momba.benchmark run` trains a grid of runs, `sweep` does on Ray, `report` compares their records, `floors`
-measures policies that learned nothing, `speed` this machine."""
+"""Comparing methods: grids of runs, on this machine or on Ray, reports from their records, and what must be beaten."""
 
 import argparse
 import sys
@@ -8,30 +7,31 @@ from collections.abc import Sequence
 import gymnasium as gym
 
 from sb3_momba.benchmark import floors, grid, report, speed, sweep
+from sb3_momba.benchmark.chapter4 import command as chapter4
+
+COMMANDS = {
+    "run": (grid, "train a grid of runs"),
+    "sweep": (sweep, "train a grid of runs on Ray"),
+    "report": (report, "compare records"),
+    "chapter4": (chapter4, "the thesis's tables and figures of records"),
+    "floors": (floors, "measure policies that learned nothing"),
+    "speed": (speed, "measure speed on this machine"),
+}
+# The options that they do not know are those of `python -m sb3_momba.train`.
+HAND_ON = ("run", "sweep")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m sb3_momba.benchmark", description=__doc__, allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True)
-    grid.add_arguments(commands.add_parser("run", help="train a grid of runs", allow_abbrev=False))
-    sweep.add_arguments(commands.add_parser("sweep", help="train a grid of runs on Ray", allow_abbrev=False))
-    report.add_arguments(commands.add_parser("report", help="compare records", allow_abbrev=False))
-    floors.add_arguments(commands.add_parser("floors", help="measure policies that learned nothing", allow_abbrev=False))
-    speed.add_arguments(commands.add_parser("speed", help="measure speed on this machine", allow_abbrev=False))
+    for name, (module, text) in COMMANDS.items():
+        module.add_arguments(commands.add_parser(name, help=text, allow_abbrev=False))
     given, rest = parser.parse_known_args(arguments)
+    module, _ = COMMANDS[given.command]
+    if rest and given.command not in HAND_ON:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
     try:
-        if given.command == "run":
-            grid.main(given, rest)
-        elif given.command == "sweep":
-            sweep.main(given, rest)
-        elif rest:
-            parser.error(f"unrecognized arguments: {' '.join(rest)}")
-        elif given.command == "report":
-            report.main(given)
-        elif given.command == "floors":
-            floors.main(given)
-        else:
-            speed.main(given)
+        module.main(given, *([rest] if given.command in HAND_ON else []))
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
 

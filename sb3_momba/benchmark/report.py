@@ -56,6 +56,8 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
         parts.append(task_table(task))
         parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
         parts += [f"Not recorded: {missing}.\n" for missing in missing_seeds(task)]
+        if task.fixed_preference:
+            parts.append(f"Not in the table: {len(task.fixed_preference)} runs of a fixed preference, points of one front.\n")
         if draw_curves(task, folder / f"curve-{name}.png"):
             parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
         if draw_fronts(task, folder / f"front-{name}.png"):
@@ -236,15 +238,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume, instead of the records' own")
 
 
-def main(given: argparse.Namespace) -> None:
-    paths = find_records(given.records)
+def read_begun(given: Sequence[Path]) -> list[Record]:
+    """The records among files and in folders; says which ones hold nothing yet.
+
+    :raises ValueError: if none does
+    """
+    paths = find_records(given)
     begun = [path for path in paths if not is_cut_off_at_its_start(path)]
     for path in paths:
         if path not in begun:
             print(f"{path} was cut off in its first line: that run is not in the report.")
     if not begun:
         raise ValueError("No run got beyond the first line of its record.")
-    records = [read_record(path) for path in begun]
+    return [read_record(path) for path in begun]
+
+
+def main(given: argparse.Namespace) -> None:
+    records = read_begun(given.records)
     first = given.records[0]
     folder = given.output or (first if first.is_dir() else first.parent)
     print(write_report(compare(records, given.reference_point), records, folder, given.baseline))

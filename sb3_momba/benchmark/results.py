@@ -2,8 +2,8 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,10 @@ from sb3_momba.records import Record
 from sb3_momba.zoo.configuration import with_later_settings
 
 Array = NDArray[np.float64]
+Metric = Literal["hypervolume", "expected_utility"]
 
+# The label of runs that were trained and evaluated for one preference alone: points of a front that they form together (4.2.4).
+FIXED_PREFERENCE = "fixed_preference"
 # Settings in which runs of one method may differ.
 NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference_point", "device", "subprocesses")
 
@@ -34,6 +37,7 @@ class Run:
 
     :param seconds: of training, at each of `steps`; of processor time where it was recorded
     :param curve: hypervolume at each of them
+    :param utility_curve: expected utility at each of them
     :param mean_over_steps: of the curve, see `areas_under_curve`
     :param mean_over_time: of the curve, see `areas_over_time`
     """
@@ -46,6 +50,7 @@ class Run:
     steps: Array
     seconds: Array
     curve: Array
+    utility_curve: Array
     mean_over_steps: float = np.nan
     mean_over_time: float = np.nan
 
@@ -58,10 +63,11 @@ class Run:
 class Task:
     """All that was run on one task.
 
-    :param methods: runs by the method's name
+    :param methods: runs by the method's name, without those of a fixed preference
     :param seconds: of training that every method had
     :param floors: hypervolume, expected utility and distance of policies that learned nothing, by name
     :param reference_front: the convex envelope of the final solutions of all methods (section 4.4), (n, n_objectives)
+    :param fixed_preference: records of runs for one preference each
     """
 
     name: str
@@ -70,6 +76,7 @@ class Task:
     floors: dict[str, tuple[float, float, float]]
     methods: dict[str, list[Run]]
     seconds: float
+    fixed_preference: list[Record] = field(default_factory=list)
 
 
 def compare(records: Iterable[Record], reference_point: ArrayLike | None = None) -> list[Task]:
@@ -86,9 +93,14 @@ def compare(records: Iterable[Record], reference_point: ArrayLike | None = None)
 
 def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLike | None) -> Task:
     reference = _reference_point(name, records, reference_point)
+    fixed = [record for record in records if is_fixed_preference(record)]
+    found = [record.final_values for record in records if record.final_values is not None]
+    front = convex_envelope(np.concatenate(found)) if found else np.zeros((0, len(reference)))
+    records = [record for record in records if not is_fixed_preference(record)]
+    if not records:
+        return Task(name, reference, front, {}, {}, 0.0, fixed)
     _check_protocol(name, records)
     final = [record.final_values for record in records if record.final_values is not None]
-    front = convex_envelope(np.concatenate(final)) if final else np.zeros((0, len(reference)))
     preferences = records[0].preferences
     # The floors do not depend on the method; a run that was cut off may lack one.
     floors = {
@@ -113,7 +125,11 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
         ]
         for method, runs in methods.items()
     }
-    return Task(name, reference, front, floors, methods, seconds)
+    return Task(name, reference, front, floors, methods, seconds, fixed)
+
+
+def is_fixed_preference(record: Record) -> bool:
+    return record.label == FIXED_PREFERENCE and len(record.preferences) == 1
 
 
 def _reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
@@ -147,11 +163,12 @@ def _score(record: Record, reference_point: Array, front: Array, earned: Sequenc
     steps = np.array([evaluation.steps for evaluation in record.evaluations], dtype=np.float64)
     seconds = np.array([e.seconds if e.cpu_seconds is None else e.cpu_seconds for e in record.evaluations])
     curve = np.array([hypervolume(evaluation.values, reference_point) for evaluation in record.evaluations])
+    utility_curve = np.array([expected_utility(evaluation.values, record.preferences) for evaluation in record.evaluations])
     values = record.final_values
     if values is None:
         utility = min((utility for _, utility, _ in earned), default=np.nan)
         distance = max((distance for _, _, distance in earned), default=np.nan)
-        return Run(record, 0.0, utility, np.nan, distance, steps, seconds, curve)
+        return Run(record, 0.0, utility, np.nan, distance, steps, seconds, curve, utility_curve)
     return Run(
         record,
         hypervolume(values, reference_point),
@@ -161,6 +178,7 @@ def _score(record: Record, reference_point: Array, front: Array, earned: Sequenc
         steps,
         seconds,
         curve,
+        utility_curve,
     )
 
 
@@ -180,14 +198,18 @@ def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
         by_label[record.label].append(record)
     methods: dict[str, list[Record]] = defaultdict(list)
     for label in sorted(by_label):
-        configs = [with_later_settings(record.config) for record in by_label[label]]
-        settings = [flat({k: v for k, v in config.items() if k not in NOT_THE_METHOD}) for config in configs]
+        settings = [method_settings(record) for record in by_label[label]]
         names = sorted({name for one in settings for name in one})
         differing = [name for name in names if len({repr(one.get(name)) for one in settings}) > 1]
         for record, one in zip(by_label[label], settings, strict=True):
-            suffix = ", ".join(f"{name.split('.')[-1]}={_as_text(one.get(name))}" for name in differing)
+            suffix = ", ".join(f"{name.split('.')[-1]}={setting_text(one.get(name))}" for name in differing)
             methods[f"{label} ({suffix})" if suffix else label].append(record)
     return dict(methods)
+
+
+def method_settings(record: Record) -> dict[str, Any]:
+    """The settings in which two runs of one method must not differ, flat."""
+    return flat({k: v for k, v in with_later_settings(record.config).items() if k not in NOT_THE_METHOD})
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -201,23 +223,25 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _as_text(value: Any) -> str:
+def setting_text(value: Any) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-def curve_on(runs: Sequence[Run]) -> tuple[Array, Array]:
-    """The hypervolume curves of one method's runs on common steps: (n,) and (n_runs, n).
+def curve_on(runs: Sequence[Run], metric: Metric = "hypervolume") -> tuple[Array, Array]:
+    """The curves of one method's runs on common steps: (n,) and (n_runs, n).
 
-    After its last evaluation a run that failed has the hypervolume 0, up to the steps that it was meant to have.
+    After its last evaluation a run that failed has what it counts with, the hypervolume 0, up to the steps that it was meant
+    to have.
     """
     steps = max((run.steps for run in runs), key=lambda s: (s[-1] if len(s) else 0, len(s)))
     planned = max((float(run.record.config.get("steps", 0)) for run in runs if not run.is_finished), default=0.0)
     if len(steps) and planned > steps[-1]:
         steps = np.append(steps, planned)
-    curves = [
-        np.interp(steps, run.steps, run.curve, right=None if run.is_finished else 0.0) if len(run.steps) else 0 * steps
-        for run in runs
-    ]
+    curves = []
+    for run in runs:
+        curve = run.curve if metric == "hypervolume" else run.utility_curve
+        failed = None if run.is_finished else getattr(run, metric)
+        curves.append(np.interp(steps, run.steps, curve, right=failed) if len(run.steps) else 0 * steps + (failed or 0.0))
     return steps, np.array(curves)
 
 

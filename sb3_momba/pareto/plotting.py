@@ -52,13 +52,8 @@ def plot_front(
     figure = Figure(figsize=(6, 4.5), layout="constrained")
     axes = figure.add_subplot(projection="3d" if n_objectives == 3 else None)
     for i, (name, p) in enumerate(points.items()):
-        _scatter(axes, p, verbatim(name), COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
-    labels = [verbatim(label) for label in labels]
-    axes.set(xlabel=labels[0], ylabel=labels[1], title=verbatim(title or ""))
-    if n_objectives == 3:
-        axes.set_zlabel(labels[2])  # type: ignore[attr-defined]
-    else:
-        axes.grid(alpha=0.3)
+        scatter_front(axes, p, name, i)
+    label_axes(axes, labels, title)
     if any(points):
         axes.legend()
     if path is not None:
@@ -73,11 +68,28 @@ def verbatim(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _scatter(axes: "Axes", points: np.ndarray, label: str, colour: str, marker: str) -> None:
+def scatter_front(axes: "Axes", points: np.ndarray, name: str, style: int) -> None:
+    """One solution set on two- or three-dimensional axes; dominated solutions are faint.
+
+    :param points: (n, n_objectives)
+    :param name: in the legend
+    :param style: the number of its colour and marker
+    """
+    colour, marker = COLOURS[style % len(COLOURS)], MARKERS[style % len(MARKERS)]
     on_front = non_dominated(points)
     axes.scatter(*points[~on_front].T, color=colour, marker=marker, s=14, alpha=0.25)  # type: ignore[misc]
     front = points[on_front]
-    axes.scatter(*front.T, color=colour, marker=marker, s=26, label=label)  # type: ignore[misc]
+    axes.scatter(*front.T, color=colour, marker=marker, s=26, label=verbatim(name))  # type: ignore[misc]
     if points.shape[1] == 2:
         front = front[front[:, 0].argsort()]
         axes.plot(*front.T, color=colour, linewidth=1, alpha=0.6)
+
+
+def label_axes(axes: "Axes", objectives: Sequence[str], title: str | None) -> None:
+    """Names of two or three objectives on the axes of a front."""
+    labels = [verbatim(label) for label in objectives]
+    axes.set(xlabel=labels[0], ylabel=labels[1], title=verbatim(title or ""))
+    if len(labels) == 3:
+        axes.set_zlabel(labels[2])  # type: ignore[attr-defined]
+    else:
+        axes.grid(alpha=0.3)

@@ -1,0 +1,203 @@
+"""The figures of chapter 4: numbers in, a PNG out. Each says whether there was anything to draw."""
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sb3_momba.benchmark.chapter4.scores import Aggregate, Curve
+from sb3_momba.benchmark.statistics import Estimate
+from sb3_momba.files import atomic_write
+from sb3_momba.pareto.plotting import COLOURS, MARKERS, label_axes, scatter_front, verbatim
+
+Array = NDArray[np.float64]
+STYLES = ("-", "--", ":", "-.")
+
+
+@dataclass(frozen=True)
+class FrontPanel:
+    """One task's fronts by name, (n, n_objectives); None keeps the colour of one that is missing."""
+
+    title: str
+    objectives: Sequence[str]
+    fronts: Mapping[str, Array | None]
+
+
+@dataclass(frozen=True)
+class CurvePanel:
+    """Curves by name, None for one that is missing; and levels, each with its name."""
+
+    title: str
+    score: str
+    curves: Mapping[str, Curve | None]
+    levels: Mapping[str, float] = field(default_factory=dict)
+
+
+def draw_fronts(panels: Sequence[FrontPanel], path: Path) -> bool:
+    """A scatter of two or three objectives for each task that has a front."""
+    shown = [panel for panel in panels if any(front is not None for front in panel.fronts.values())]
+    if not shown:
+        return False
+    with default_style():
+        columns, rows = layout(len(shown))
+        figure = Figure(figsize=(4 * columns, 3.4 * rows + 0.6), layout="constrained")
+        for place, panel in enumerate(shown, start=1):
+            is_solid = len(panel.objectives) == 3
+            axes = figure.add_subplot(rows, columns, place, projection="3d" if is_solid else None)
+            for style, (name, front) in enumerate(panel.fronts.items()):
+                if front is not None:
+                    scatter_front(axes, front, name, style)
+            label_axes(axes, panel.objectives, panel.title)
+        write(figure, path)
+    return True
+
+
+def draw_curves(panels: Sequence[CurvePanel], path: Path, columns: int | None = None) -> bool:
+    """Scores over steps with their intervals; levels are horizontal.
+
+    :param columns: of panels; by default as many as look well
+    """
+    shown = [panel for panel in panels if any(curve is not None for curve in panel.curves.values())]
+    if not shown:
+        return False
+    with default_style():
+        n_columns, n_rows = layout(len(shown)) if columns is None else (columns, -(-len(shown) // columns))
+        figure = Figure(figsize=(4 * n_columns, 3 * n_rows + 0.6), layout="constrained")
+        for place, panel in enumerate(shown, start=1):
+            axes = figure.add_subplot(n_rows, n_columns, place)
+            for style, (name, curve) in enumerate(panel.curves.items()):
+                if curve is not None:
+                    draw_curve(axes, curve, name, style)
+            for style, (name, level) in enumerate(panel.levels.items(), start=1):
+                axes.axhline(level, color="grey", linestyle=STYLES[style % len(STYLES)], linewidth=1, label=verbatim(name))
+            axes.set(xlabel="environment steps", ylabel=panel.score, title=verbatim(panel.title))
+            axes.grid(alpha=0.3)
+        write(figure, path)
+    return True
+
+
+def draw_curve(axes: Axes, curve: Curve, name: str, style: int) -> None:
+    colour = COLOURS[style % len(COLOURS)]
+    marker = MARKERS[style % len(MARKERS)] if len(curve.steps) == 1 else None
+    axes.plot(curve.steps, [point.value for point in curve.points], color=colour, marker=marker, label=verbatim(name))
+    low, high = [point.low for point in curve.points], [point.high for point in curve.points]
+    axes.fill_between(curve.steps, low, high, color=colour, alpha=0.2, linewidth=0)
+
+
+def draw_estimates(panels: Mapping[str, Mapping[str, Aggregate]], path: Path) -> bool:
+    """A row of points with intervals for each score, one point for each method."""
+    if not any(one.estimate is not None for found in panels.values() for one in found.values()):
+        return False
+    with default_style():
+        figure = Figure(figsize=(1 + 4 * len(panels), 3.4), layout="constrained")
+        for place, (score, found) in enumerate(panels.items(), start=1):
+            axes = figure.add_subplot(1, len(panels), place)
+            draw_points(axes, {name: one.estimate for name, one in found.items()})
+            axes.set_xlabel(score)
+        write(figure, path, has_legend=False)
+    return True
+
+
+def draw_points(axes: Axes, found: Mapping[str, Estimate | None]) -> None:
+    """Names from top to bottom; one that is missing keeps its line."""
+    for place, one in enumerate(found.values()):
+        if one is not None:
+            error_bar(axes, one.value, place, one, place, across=True)
+    axes.set_yticks(range(len(found)), [verbatim(name if one else f"{name} (missing)") for name, one in found.items()])
+    axes.set_ylim(len(found) - 0.5, -0.5)
+    axes.grid(alpha=0.3, axis="x")
+
+
+def draw_groups(groups: Mapping[str, Mapping[str, Aggregate]], score: str, path: Path) -> bool:
+    """Figure 4.7: in each group one point per member, side by side."""
+    if not any(one.estimate is not None for members in groups.values() for one in members.values()):
+        return False
+    with default_style():
+        figure = Figure(figsize=(1.6 * len(groups) + 1, 3.6), layout="constrained")
+        axes = figure.add_subplot()
+        for place, members in enumerate(groups.values()):
+            for style, (name, one) in enumerate(members.items()):
+                if one.estimate is not None:
+                    x = place + 0.3 * (style - (len(members) - 1) / 2)
+                    error_bar(axes, x, one.estimate.value, one.estimate, style, label=name)
+        axes.set_xticks(range(len(groups)), [verbatim(name) for name in groups])
+        axes.set_xlim(-0.5, len(groups) - 0.5)
+        axes.set_ylabel(score)
+        axes.grid(alpha=0.3, axis="y")
+        write(figure, path)
+    return True
+
+
+def draw_scaling(lines: Mapping[str, Sequence[tuple[float, Estimate]]], score: str, path: Path) -> bool:
+    """Figure 4.8.
+
+    :param lines: (critic parameters, score) of each size, by configuration; an empty one keeps its colour
+    """
+    if not any(lines.values()):
+        return False
+    with default_style():
+        figure = Figure(figsize=(6, 4), layout="constrained")
+        axes = figure.add_subplot()
+        for style, (name, points) in enumerate(lines.items()):
+            if points:
+                colour = COLOURS[style % len(COLOURS)]
+                axes.plot([x for x, _ in points], [one.value for _, one in points], color=colour, linewidth=1)
+            for x, one in points:
+                error_bar(axes, x, one.value, one, style, label=name)
+        axes.set(xscale="log", xlabel="critic parameters", ylabel=score)
+        axes.grid(alpha=0.3)
+        write(figure, path)
+    return True
+
+
+def draw_normalisation(found: Mapping[str, Aggregate], shapley: Mapping[str, float], score: str, path: Path) -> bool:
+    """Figure 4.9: the combinations to the left, the Shapley values to the right where they are known."""
+    if not any(one.estimate is not None for one in found.values()):
+        return False
+    with default_style():
+        figure = Figure(figsize=(9, 3.8), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+        draw_points(left, {name: one.estimate for name, one in found.items()})
+        left.set_xlabel(score)
+        right.bar(list(shapley), list(shapley.values()), color=COLOURS[0])
+        right.axhline(0, color="black", linewidth=0.8)
+        right.set(ylabel="Shapley value", title="" if shapley else "missing")
+        right.grid(alpha=0.3, axis="y")
+        write(figure, path, has_legend=False)
+    return True
+
+
+def error_bar(axes: Axes, x: float, y: float, one: Estimate, style: int, label: str = "", across: bool = False) -> None:
+    """:param across: the interval lies along x"""
+    lengths = [[max(one.value - one.low, 0)], [max(one.high - one.value, 0)]]
+    colour, marker = COLOURS[style % len(COLOURS)], MARKERS[style % len(MARKERS)]
+    bars = {"xerr": lengths} if across else {"yerr": lengths}
+    axes.errorbar([x], [y], **bars, color=colour, marker=marker, capsize=3, linestyle="", label=verbatim(label))  # type: ignore[arg-type]
+
+
+def layout(n: int) -> tuple[int, int]:
+    """Columns and rows of n panels: at most four side by side."""
+    columns = min(n, 4)
+    return columns, -(-n // columns)
+
+
+def default_style() -> contextlib.AbstractContextManager[None]:
+    """A matplotlibrc of the user's or of the working directory would change the pictures."""
+    return matplotlib.style.context("default")
+
+
+def write(figure: Figure, path: Path, has_legend: bool = True) -> None:
+    """Bytes that the numbers and the library's version alone decide; one legend for all panels."""
+    entries = [entry for axes in figure.axes for entry in zip(*axes.get_legend_handles_labels(), strict=True)]
+    named = {label: handle for handle, label in reversed(entries)}
+    if has_legend and named:
+        order = dict.fromkeys(label for _, label in entries)
+        figure.legend([named[label] for label in order], list(order), loc="outside lower center", ncols=min(len(order), 4))
+    with atomic_write(path) as file:
+        figure.savefig(file, dpi=120, format="png", metadata={"Software": None})

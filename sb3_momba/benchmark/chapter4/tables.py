@@ -1,0 +1,140 @@
+"""The tables of chapter 4, and the numbers beside its figures, in Markdown: the records' and the thesis's."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sb3_momba.benchmark.chapter4.cells import CONDITIONING, IMPROVEMENTS, MAIN, Labels, Methods
+from sb3_momba.benchmark.chapter4.differences import MISSING, all_runs, names, range_text, steps_of
+from sb3_momba.benchmark.chapter4.scores import (
+    Aggregate,
+    Tasks,
+    Unit,
+    ablation_units,
+    aggregate,
+    runs_of,
+    score_of,
+)
+from sb3_momba.benchmark.chapter4.thesis import read_thesis, scaled
+from sb3_momba.benchmark.report import median_run
+from sb3_momba.benchmark.results import Metric, Run
+from sb3_momba.benchmark.statistics import Estimate
+from sb3_momba.benchmark.tables import as_text, markdown
+
+SHORT: dict[Metric, str] = {"hypervolume": "HV", "expected_utility": "EUM"}
+
+
+def table_4_2(tasks: Tasks) -> str:
+    """Summary of the algorithms; parameters are the mean over the tasks that have runs, of a single policy."""
+    columns = ("policies", "trainable parameters", "training steps")
+    rows = [["algorithm", "classification", *(f"{who}{name}" for name in columns for who in ("", "thesis: "))]]
+    for title, labels in MAIN.items():
+        published = read_thesis().methods[title]
+        ours = summary(tasks, labels)
+        theirs = [range_text(published.policies), range_text(published.parameters), range_text(published.steps)]
+        rows.append([title, published.classification, *(cell for pair in zip(ours, theirs, strict=True) for cell in pair)])
+    return markdown(rows)
+
+
+def summary(tasks: Tasks, labels: Labels) -> list[str]:
+    """Policies, parameters and steps of a method's runs."""
+    runs = all_runs(tasks, labels)
+    if not runs:
+        return [MISSING] * 3
+    first = [runs_of(task, labels)[0] for task in tasks.values() if runs_of(task, labels)]
+    parameters = [sum(run.record.parameters.values()) for run in first if run.record.parameters]
+    policies = [n for n in map(n_policies, runs) if n is not None]
+    steps = [steps_of(run) for run in runs]
+    return [
+        range_text((min(policies), max(policies))) if policies else MISSING,
+        f"{np.mean(parameters):,.0f}" if parameters else MISSING,
+        range_text((min(steps), max(steps))),
+    ]
+
+
+def n_policies(run: Run) -> int | None:
+    """One of a general policy, as many as solutions of several; unknown of a run that did not finish with several."""
+    if run.record.general_policy:
+        return 1
+    return None if run.record.final_values is None else len(run.record.final_values)
+
+
+def table_4_3(tasks: Tasks) -> str:
+    """Results per task, in the units of the thesis's table."""
+    rows = [["environment", "metric", "of", *MAIN]]
+    for env, published in read_thesis().tasks.items():
+        for metric, short in SHORT.items():
+            unit = published.units[metric]
+            ours = [score_of(runs_of(tasks.get(env), labels), metric) for labels in MAIN.values()]
+            theirs = [published.scores[metric][title] for title in MAIN]
+            unit_text = f"{short} / 10^{round(np.log10(unit))}"
+            for of, scores in (("records", ours), ("thesis", theirs)):
+                rows.append([published.name, unit_text, of, *with_best_in_bold(scores, 1 / unit)])
+    return markdown(rows)
+
+
+def with_best_in_bold(scores: Sequence[Estimate | None], factor: float) -> list[str]:
+    """Nothing is best that stands alone."""
+    known = [score.value for score in scores if score is not None]
+    cells = []
+    for score in scores:
+        text = MISSING if score is None else as_text(scaled(score, factor))
+        is_best = score is not None and len(known) > 1 and score.value == max(known)
+        cells.append(f"**{text}**" if is_best else text)
+    return cells
+
+
+def table_4_4(tasks: Tasks) -> str:
+    """Conditioning: hypervolume in units of Momba's."""
+    unit, published = ablation_units(tasks), read_thesis().conditioning
+    rows = [["conditioning style", "runs", "tasks", "normalised HV", "thesis"]]
+    for title, labels in CONDITIONING.items():
+        rows.append([title, *aggregate_cells(aggregate(tasks, labels, "hypervolume", unit)), as_text(published[title])])
+    return markdown(rows)
+
+
+def table_4_5(tasks: Tasks) -> str:
+    """HER and PAR: hypervolume in units of Momba's, and IGD."""
+    unit, published = ablation_units(tasks), read_thesis().improvements
+    rows = [["configuration", "runs", "tasks", "normalised HV", "thesis", "runs", "tasks", "IGD", "thesis"]]
+    for title, labels in IMPROVEMENTS.items():
+        volume = aggregate(tasks, labels, "hypervolume", unit)
+        distance = aggregate(tasks, labels, "inverted_generational_distance")
+        theirs = published[title]
+        cells = [*aggregate_cells(volume), as_text(theirs["hypervolume"])]
+        rows.append([title, *cells, *aggregate_cells(distance), as_text(theirs["distance"])])
+    return markdown(rows)
+
+
+def aggregate_table(header: str, found: Mapping[str, Aggregate], score: str) -> str:
+    """One score of several configurations."""
+    rows = [[header, "runs", "tasks", score], *([title, *aggregate_cells(one)] for title, one in found.items())]
+    return markdown(rows)
+
+
+def aggregate_cells(found: Aggregate) -> list[str]:
+    """Runs, tasks and the score."""
+    if found.estimate is None:
+        return [MISSING] * 3
+    every = len(found.tasks) == len(read_thesis().tasks)
+    return [f"{found.finished}/{found.runs}", "all" if every else names(found.tasks), as_text(found.estimate)]
+
+
+def seeds_table(tasks: Tasks, methods: Methods) -> str:
+    """The seed of median hypervolume of each method on each task, whose front a figure shows."""
+    rows = [["task", *methods]]
+    for env, published in read_thesis().tasks.items():
+        chosen = [median_run(runs_of(tasks.get(env), labels)) for labels in methods.values()]
+        rows.append([published.name, *(MISSING if run is None else f"seed {run.record.seed}" for run in chosen)])
+    return markdown(rows)
+
+
+def unit_note(tasks: Tasks, unit: Mapping[str, Unit], title: str, metric: Metric) -> str:
+    """Whose numbers the scores are divided by, and on which tasks there is none."""
+    ours = [env for env in tasks if env in unit and not unit[env].published]
+    theirs = [env for env in tasks if env in unit and unit[env].published]
+    lacking = [env for env in tasks if env not in unit]
+    parts = [f"of the records on {names(ours)}"] if ours else []
+    parts += [f"as the thesis has it on {names(theirs)}"] if theirs else []
+    parts += [f"missing or not above 0 on {names(lacking)}, which the aggregates leave out"] if lacking else []
+    return f"Unit of {SHORT[metric]}: the IQM of {title}, {'; '.join(parts)}.\n"
