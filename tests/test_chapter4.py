@@ -4,21 +4,26 @@ import itertools
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+import sb3_momba
 from sb3_momba import records
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.chapter4 import cells
 from sb3_momba.benchmark.chapter4.cells import MOMBA
 from sb3_momba.benchmark.chapter4.command import write_chapter
 from sb3_momba.benchmark.chapter4.differences import differences, missing_note, steps_note
+from sb3_momba.benchmark.chapter4.figure31 import predicted, reset_observations
 from sb3_momba.benchmark.chapter4.scores import (
     aggregate,
     aggregate_curve,
@@ -41,6 +46,7 @@ from sb3_momba.benchmark.report import write_report
 from sb3_momba.benchmark.results import compare, curve_on
 from sb3_momba.records import Record, plain
 from sb3_momba.zoo.configuration import read_configuration, shipped_configurations, with_defaults
+from tests.stubs import tiny_model
 from tests.test_benchmark import BAD, FRONT, PNG, box, hyperparameters, write_record
 
 FIRST = Path(__file__).parent.parent / "docs" / "results" / "first"
@@ -574,3 +580,82 @@ def test_bad_input_ends_with_one_line_of_error_before_anything_is_written(fake, 
     with pytest.raises(SystemExit, match="does not exist"):
         main(["chapter4", str(tmp_path / "nothing")])
     assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------------------------------------------------------- figure 3.1
+
+
+class OneStep(gym.Env):
+    """Earns (1, 3), whatever is done."""
+
+    observation_space = spaces.Box(-1, 1, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+    reward_space = spaces.Box(-5, 5, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 1).astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, ...]:
+        return np.zeros(1, np.float32), np.array([1, 3], np.float32), True, False, {}
+
+
+@pytest.fixture
+def one_step() -> Iterator[str]:
+    gym.register("OneStep-v0", OneStep)
+    yield "OneStep-v0"
+    del gym.registry["OneStep-v0"]
+
+
+def trained(env: str, **kwargs: Any) -> sb3_momba.MOMBA:
+    policy_kwargs = {"net_arch": [32, 32], "n_atoms": 41}
+    model = tiny_model(env, "MlpPolicy", learning_rate=3e-3, ent_coef=0.01, policy_kwargs=policy_kwargs, **kwargs)
+    return model.learn(300)
+
+
+def test_reset_observations_are_those_of_the_episodes_with_the_preference_last(one_step) -> None:
+    found = reset_observations(one_step, np.array([0.25, 0.75]), 3, seed=5)
+    starts = [OneStep().reset(seed=seed)[0][0] for seed in (5, 6, 7)]
+    np.testing.assert_array_equal(found, [[start, 0.25, 0.75] for start in np.float32(starts)])
+
+
+@pytest.mark.parametrize("vector", [False, True], ids=["scalarised", "vector"])
+def test_predicted_distributions_by_hand(one_step, vector: bool) -> None:
+    """Of one critic with all its mass, softmax of 40 against 0, on the second atom, and one with it on the third."""
+    model = tiny_model(one_step, vector_values=vector)
+    model.policy.return_scale.max_return.fill_(6.0)  # Rewards are halved.
+    n_values = 2 if vector else 1
+    logits = th.zeros(3, 2, n_values, 11)
+    logits[:, 0, :, 1] = logits[:, 1, :, 2] = 40.0
+    model.policy.critic.forward = lambda observations, actions: logits
+    state = th.get_rng_state()
+    atoms, probabilities = predicted(model, np.zeros((3, 3), np.float32))
+    assert th.equal(th.get_rng_state(), state)
+    np.testing.assert_allclose(atoms, np.arange(-10, 11, 2))
+    np.testing.assert_allclose(probabilities, [[0, 0.5, 0.5, *[0] * 8]] * n_values, atol=1e-12)
+
+
+def test_figure_3_1_of_critics_that_have_learned(one_step, tmp_path, capsys) -> None:
+    """Both know that (1, 3) is earned, so that w = (0.5, 0.5) is worth 2."""
+    for name, vector in (("scalarised", False), ("vector", True)):
+        trained(one_step, vector_values=vector).save(tmp_path / f"{name}.zip")
+    models = [str(tmp_path / f"{name}.zip") for name in ("scalarised", "vector")]
+    main(["figure31", one_step, *models, "--output", str(tmp_path / "one.png"), "--episodes", "8"])
+    assert (tmp_path / "one.png").read_bytes().startswith(PNG)
+    rows = cells_of(capsys.readouterr().out)[1:10]
+    exact = {"objective 1": 1.0, "objective 2": 3.0}
+    scalarised = {"[0, 1]": 3.0, "[0.5, 0.5]": 2.0, "[1, 0]": 1.0}
+    assert len(rows) == 3 + 6
+    for _, preference, name, by_critic, by_rollouts in rows:
+        expected = exact.get(name) or scalarised[preference]
+        assert float(by_rollouts) == expected
+        assert float(by_critic) == pytest.approx(expected, abs=0.3)
+
+
+def test_models_without_distributions_or_preferences_are_refused(one_step, tmp_path) -> None:
+    tiny_model(one_step, critic_loss="mse").save(tmp_path / "mse.zip")
+    tiny_model("Pendulum-v1").save(tmp_path / "single.zip")
+    for name, said in (("mse", "predict no distribution"), ("single", "one objective"), ("nothing", "nothing.zip")):
+        with pytest.raises(SystemExit, match=said):
+            main(["figure31", one_step, str(tmp_path / f"{name}.zip"), "--output", str(tmp_path / "out.png")])
+    assert not (tmp_path / "out.png").exists()

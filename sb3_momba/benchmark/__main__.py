@@ -8,12 +8,14 @@ import gymnasium as gym
 
 from sb3_momba.benchmark import floors, grid, report, speed, sweep
 from sb3_momba.benchmark.chapter4 import command as chapter4
+from sb3_momba.benchmark.chapter4 import figure31
 
 COMMANDS = {
     "run": (grid, "train a grid of runs"),
     "sweep": (sweep, "train a grid of runs on Ray"),
     "report": (report, "compare records"),
     "chapter4": (chapter4, "the thesis's tables and figures of records"),
+    "figure31": (figure31, "the return distributions of saved critics"),
     "floors": (floors, "measure policies that learned nothing"),
     "speed": (speed, "measure speed on this machine"),
 }

@@ -9,6 +9,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from sb3_momba.benchmark.chapter4.scores import Aggregate, Curve
@@ -54,6 +55,8 @@ def draw_fronts(panels: Sequence[FrontPanel], path: Path) -> bool:
                 if front is not None:
                     scatter_front(axes, front, name, style)
             label_axes(axes, panel.objectives, panel.title)
+            if is_solid:
+                axes.set_box_aspect(None, zoom=0.8)  # type: ignore[call-arg]  # Room for the labels, which layouts overlook.
         write(figure, path)
     return True
 
@@ -77,6 +80,8 @@ def draw_curves(panels: Sequence[CurvePanel], path: Path, columns: int | None = 
             for style, (name, level) in enumerate(panel.levels.items(), start=1):
                 axes.axhline(level, color="grey", linestyle=STYLES[style % len(STYLES)], linewidth=1, label=verbatim(name))
             axes.set(xlabel="environment steps", ylabel=panel.score, title=verbatim(panel.title))
+            axes.xaxis.set_major_locator(MaxNLocator(5))
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.grid(alpha=0.3)
         write(figure, path)
     return True
@@ -198,6 +203,6 @@ def write(figure: Figure, path: Path, has_legend: bool = True) -> None:
     named = {label: handle for handle, label in reversed(entries)}
     if has_legend and named:
         order = dict.fromkeys(label for _, label in entries)
-        figure.legend([named[label] for label in order], list(order), loc="outside lower center", ncols=min(len(order), 4))
+        figure.legend([named[label] for label in order], list(order), loc="outside lower center", ncols=min(len(order), 5))
     with atomic_write(path) as file:
         figure.savefig(file, dpi=120, format="png", metadata={"Software": None})
