@@ -371,7 +371,7 @@ def test_runs_of_fixed_preferences_form_one_front(fake, fixed, tmp_path) -> None
 def test_the_report_of_any_task_says_that_fixed_preferences_are_not_in_it(fake, fixed, tmp_path) -> None:
     made = [fake("momba", FRONT), fixed([1.0, 3.0], [0.0, 1.0]), fixed([1.0, 1.0], [0.0, 1.0], env=WALKER)]
     text = write_report(compare(made), made, tmp_path)
-    assert text.count("1 runs of a fixed preference") == 2
+    assert text.count("runs of a fixed preference each, 1,") == 2
 
 
 def test_sizes_of_critics_are_means_over_the_tasks(fake) -> None:

@@ -57,7 +57,9 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
         parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
         parts += [f"Not recorded: {missing}.\n" for missing in missing_seeds(task)]
         if task.fixed_preference:
-            parts.append(f"Not in the table: {len(task.fixed_preference)} runs of a fixed preference, points of one front.\n")
+            parts.append(
+                f"Not in the table: runs of a fixed preference each, {len(task.fixed_preference)}, points of one front.\n"
+            )
         if draw_curves(task, folder / f"curve-{name}.png"):
             parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
         if draw_fronts(task, folder / f"front-{name}.png"):
