@@ -534,6 +534,9 @@ def test_runs_that_all_failed_make_a_chapter(fake, tmp_path) -> None:
 def test_the_chapter_is_the_same_from_everywhere(fake, tmp_path, monkeypatch) -> None:
     """From other folders, in another order of files, in another process with another matplotlibrc."""
     one_of_each(fake, HOPPER, 2)
+    for seed in range(1, 7):  # The bootstrap draws runs by their number.
+        values = np.random.default_rng(seed).uniform(1, 3, (3, 2))
+        fake("momba", values, {100_000: values / 2, 300_000: values}, seed=seed)
     source = tmp_path / "records"
     one, other = tmp_path / "one", tmp_path / "elsewhere" / "other"
     other.mkdir(parents=True)

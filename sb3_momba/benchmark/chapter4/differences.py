@@ -129,9 +129,7 @@ def differing(record: Record) -> dict[str, tuple[str, str]]:
 
 def published_settings(record: Record) -> dict[str, Any]:
     """Of a record's label, flat; a tuple is a range."""
-    settings: dict[str, Any] = {"n_episodes": protocol.N_EPISODES}
-    if record.label != FIXED:
-        settings["n_preferences"] = protocol.N_PREFERENCES
+    settings: dict[str, Any] = {"n_preferences": protocol.N_PREFERENCES, "n_episodes": protocol.N_EPISODES}
     configuration = "momba" if record.label == FIXED else record.label
     if configuration in shipped_configurations() and "hyperparameters" in record.config:
         read = read_configuration(configuration, raw_id(record.env))
@@ -141,8 +139,6 @@ def published_settings(record: Record) -> dict[str, Any]:
             "n_envs": read.n_envs,
             "hyperparameters": plain(with_defaults(read.policy, read.hyperparameters)),
         }
-        if record.label == FIXED:
-            del settings["hyperparameters"]["preference_sampler"]
     found = flat(settings)
     method = STEPS_OF.get(record.label) or next((title for title, labels in MAIN.items() if record.label in labels), None)
     if "steps" not in found and method is not None:

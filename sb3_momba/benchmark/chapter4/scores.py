@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import factorial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,12 @@ def tasks_of(records: Iterable[Record]) -> dict[str, Task]:
 
 def in_order(records: Iterable[Record]) -> list[Record]:
     """By what they say, not by where they lie."""
-    return sorted(records, key=lambda record: (record.task, record.label, record.seed, str(record.start.get("started"))))
+
+    def content(record: Record) -> tuple[Any, ...]:
+        values = [] if record.final_values is None else record.final_values.tolist()
+        return record.task, record.label, record.seed, str(record.start.get("started")), values
+
+    return sorted(records, key=content)
 
 
 def check_one_setting(records: Iterable[Record]) -> None:
