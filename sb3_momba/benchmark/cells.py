@@ -7,7 +7,7 @@ A grid is a yaml file:
     seeds: 10                        # they are 0 to 9
     options: {eval_freq: 20_000}     # of `python -m sb3_momba.train`; none by default
     auto_ent_coef: 0.01              # where variants that learn alpha start it; by default their own
-    fixed_preferences: {2: 20}       # by number of objectives: one run for each of so many preferences (section 4.2.4)
+    fixed_preferences: {2: 20}       # by number of objectives: one run of a single variant for each of so many (section 4.2.4)
 """
 
 import argparse
@@ -23,7 +23,7 @@ from typing import Any
 
 import yaml
 
-from sb3_momba.benchmark.results import flat
+from sb3_momba.benchmark.results import FIXED_PREFERENCE, flat
 from sb3_momba.checkpoints.folders import newest
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.files import LOCK, FileFormatError
@@ -35,7 +35,6 @@ from sb3_momba.train import parse
 from sb3_momba.zoo.configuration import literal, read_configuration, with_later_settings
 
 SHIPPED = resources.files("sb3_momba.benchmark") / "grids"
-FIXED_PREFERENCE = "fixed_preference"
 
 
 @dataclass(frozen=True)
@@ -152,14 +151,13 @@ def _with_fixed_preferences(cell: Cell, numbers: Mapping[int, int]) -> list[Cell
     n_objectives = probe_environment(cell.env).n_objectives
     if n_objectives not in numbers:
         raise ValueError(f"fixed_preferences={dict(numbers)}: {cell.env} has {n_objectives} objectives; say how many for it.")
-    conf = "" if Path(cell.conf).stem == "momba" else f"-{Path(cell.conf).stem}"
     return [
         Cell(
             cell.conf,
             cell.env,
             cell.seed,
-            (*cell.options, "--label", f"{FIXED_PREFERENCE}{conf}", "--preference", *map(str, preference)),
-            f"{FIXED_PREFERENCE}{conf}-{number:02}",
+            (*cell.options, "--label", FIXED_PREFERENCE, "--preference", *map(str, preference)),
+            f"{FIXED_PREFERENCE}-{number:02}",
         )
         for number, preference in enumerate(preference_grid(n_objectives, numbers[n_objectives]).tolist())
     ]
