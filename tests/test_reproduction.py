@@ -1,0 +1,27 @@
+"""The reports in docs/results are what their records give, bit for bit, with the versions of constraints.txt."""
+
+import re
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+from sb3_momba.benchmark.__main__ import main
+
+ROOT = Path(__file__).parent.parent
+COMMANDS = {"report.md": "report", "chapter4.md": "chapter4"}
+REPORTS = sorted(path for name in COMMANDS for path in (ROOT / "docs" / "results").rglob(name))
+PINNED = re.search(r"^matplotlib==([\d.]+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("report", REPORTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_reports_are_made_of_the_records_beside_them(tmp_path, report: Path) -> None:
+    main([COMMANDS[report.name], str(report.parent), "--output", str(tmp_path)])
+    assert PINNED is not None
+    for made in sorted(tmp_path.iterdir()):
+        if made.suffix == ".png" and matplotlib.__version__ != PINNED.group(1):
+            continue  # Another release draws text otherwise.
+        assert made.read_bytes() == (report.parent / made.name).read_bytes(), made.name
+    pictures = re.findall(r"\]\(([^)]+\.png)\)", report.read_text())
+    assert pictures
+    assert all((tmp_path / picture).exists() for picture in pictures)
