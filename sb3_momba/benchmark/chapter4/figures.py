@@ -56,7 +56,8 @@ def draw_fronts(panels: Sequence[FrontPanel], path: Path) -> bool:
                     scatter_front(axes, front, name, style)
             label_axes(axes, panel.objectives, panel.title)
             if is_solid:
-                axes.set_box_aspect(None, zoom=0.8)  # type: ignore[call-arg]  # Room for the labels, which layouts overlook.
+                axes.set_box_aspect(None, zoom=0.9)  # type: ignore[call-arg]  # Room for the labels, which layouts overlook.
+                axes.locator_params(nbins=4)
         write(figure, path)
     return True
 
