@@ -11,8 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-# Before Ray is imported: no statistics are sent, Ctrl-C ends the sweep, trials need no logs beside the runs' own.
+# Before Ray is imported: no statistics are sent, trials have the priority of any training, Ctrl-C ends the sweep, trials need
+# no logs beside the runs' own.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_worker_niceness", "0")
 os.environ.setdefault("TUNE_DISABLE_SIGINT_HANDLER", "1")
 os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")
 
