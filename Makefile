@@ -5,13 +5,22 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test lint known-fronts first-records evidence rounding speed torture compat clean
+.PHONY: demo test browser lint known-fronts first-records evidence rounding speed torture compat clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
 
-test: $(VENV)/tools
+test: $(VENV)/tools browser
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2
+
+# What the explorer's tests need of the system: a browser, and OpenGL that draws without a window.
+browser:
+	@if command -v chromium >/dev/null && ldconfig -p | grep -q libEGL.so.1; then exit 0; fi; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium libegl1 libgl1-mesa-dri >/dev/null; \
+	fi || true; \
+	command -v chromium >/dev/null && ldconfig -p | grep -q libEGL.so.1 || \
+		echo "make browser: chromium or libegl1 is missing and could not be installed; tests that need them will say so."
 
 lint: $(VENV)/tools
 	$(BIN)/ruff check .

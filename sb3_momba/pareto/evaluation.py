@@ -169,11 +169,11 @@ def evaluate_front(
     jobs = [(number, w, one_seed) for number, (w, one_seed) in enumerate(each)]
 
     if n_workers == 1:
-        returns, discounted, lengths = _run_jobs(model, env, env_kwargs, jobs, gamma, deterministic)
+        returns, discounted, lengths = run_jobs(model, env, env_kwargs, jobs, gamma, deterministic)
     else:
         policy = model.policy if isinstance(model, BaseAlgorithm) else model  # without environments and replay buffer
         parts = [jobs[i::n_workers] for i in range(n_workers)]
-        results = in_processes(_run_jobs, [(policy, env, env_kwargs, part, gamma, deterministic) for part in parts if part])
+        results = in_processes(run_jobs, [(policy, env, env_kwargs, part, gamma, deterministic) for part in parts if part])
         n_objectives = grid.shape[1]
         returns, discounted = np.zeros((2, len(jobs), n_objectives))
         lengths = np.zeros(len(jobs), dtype=np.int64)
@@ -194,7 +194,7 @@ Jobs = Sequence[tuple[int, np.ndarray, int]]  # number among all jobs, preferenc
 Measured = tuple[Array, Array, NDArray[np.int64]]
 
 
-def _run_jobs(
+def run_jobs(
     model: Predictor,
     env: str | gym.Env | VecEnv | Callable[[], gym.Env],
     env_kwargs: dict[str, Any] | None,

@@ -1,0 +1,57 @@
+"""`python -m sb3_momba.explorer report RUN` writes a page about runs, `strobe RUN` pictures of what their policies do."""
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+
+from sb3_momba.explorer.report import write_report
+from sb3_momba.explorer.stage import RenderingError
+from sb3_momba.explorer.strobe import draw_strobe
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m sb3_momba.explorer", description=__doc__, allow_abbrev=False)
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    report = commands.add_parser("report", help="one HTML file about runs of one task", allow_abbrev=False)
+    report.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of a run")
+    report.add_argument("--output", type=Path, help="the file; by default report.html in the first RUN")
+    report.add_argument("--films", type=int, help="preferences filmed of each run, 0 for none; by default 20 for all runs")
+    report.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume, instead of the records' own")
+
+    strobe = commands.add_parser("strobe", help="a picture of the poses along each path", allow_abbrev=False)
+    strobe.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    strobe.add_argument(
+        "--preferences", nargs="+", type=weights, metavar="W1,W2,...", help="such as 1,0 0.5,0.5 0,1; by default four of them"
+    )
+    strobe.add_argument("--output", type=Path, help="the picture; by default strobe.png in RUN")
+    strobe.add_argument("--steps", type=int, help="how long each path is; by default 3 s of simulated time")
+    strobe.add_argument("--poses", type=int, default=8, help="how many of them are drawn along it")
+
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    try:
+        if given.command == "report":
+            if given.films is not None and given.films < 0:
+                raise ValueError(f"--films {given.films}: give 0 or more.")
+            path = given.output or given.runs[0] / "report.html"
+            write_report(given.runs, path, given.films, given.reference_point)
+        else:
+            path = given.output or given.run / "strobe.png"
+            draw_strobe(given.run, path, given.preferences, given.steps, given.poses)
+        print(f"Written to {path} ({path.stat().st_size / 1e6:.1f} MB).")
+    except (ValueError, OSError, ImportError, RenderingError, gym.error.Error) as error:
+        sys.exit(f"error: {error}")
+
+
+def weights(text: str) -> list[float]:
+    """ "0.3,0.7" -> [0.3, 0.7]"""
+    return [float(weight) for weight in text.split(",")]
+
+
+if __name__ == "__main__":
+    main()

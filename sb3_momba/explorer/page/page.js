@@ -1,0 +1,289 @@
+"use strict";
+(() => {
+  const report = JSON.parse(document.getElementById("data").textContent);
+  const at = (id) => document.getElementById(id);
+  const { runs, objectives } = report;
+  const isLine = objectives.length !== 2 && objectives.length !== 3;
+  const stillness = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const config = { responsive: true, displaylogo: false, displayModeBar: false };
+  const selected = { run: 0, point: 0 };
+  let film = null;
+
+  // As charts.number writes them.
+  function number(x) {
+    for (const [size, unit] of [[1e12, ""], [1e9, " G"], [1e6, " M"]]) {
+      if (Math.abs(x) >= size) return size === 1e12 ? x.toExponential(3) : `${Number((x / size).toPrecision(4))}${unit}`;
+    }
+    if (Math.abs(x) >= 1000) return Math.round(x).toLocaleString("en");
+    return x === 0 || Math.abs(x) >= 1e-3 ? String(Number(x.toPrecision(4))) : x.toExponential(1);
+  }
+
+  function element(tag, text, attributes = {}) {
+    const made = document.createElement(tag);
+    if (text !== undefined) made.textContent = text;
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    return made;
+  }
+
+  function svg(tag, attributes) {
+    const made = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    return made;
+  }
+
+  const weights = (run, point) =>
+    run.preferences === null ? `solution ${point + 1}` : run.preferences[point].map((w) => w.toFixed(2)).join(" / ");
+
+  function describe(run, point) {
+    if (run.preferences === null) return `solution ${point + 1}`;
+    return run.preferences[point].map((w, i) => `${w.toFixed(2)} ${objectives[i]}`).join(", ");
+  }
+
+  // Where the slider stops: at what was filmed, or else at every point.
+  const stops = (run) => (run.films.length > 0 ? run.films.map((one) => one.point) : run.values.map((_, i) => i));
+
+  function nearest(run, point, candidates) {
+    if (run.preferences === null || candidates.includes(point)) return Math.max(candidates.indexOf(point), 0);
+    const distances = candidates.map((other) =>
+      run.preferences[other].reduce((sum, w, i) => sum + (w - run.preferences[point][i]) ** 2, 0));
+    return distances.indexOf(Math.min(...distances));
+  }
+
+  function coordinates(run, point) {
+    const values = run.values[point];
+    if (!isLine) return Object.fromEntries(values.map((v, i) => ["xyz"[i], [[v]]]));
+    const [low, high] = report.ranges;
+    const heights = values.map((v, i) => (high[i] > low[i] ? (v - low[i]) / (high[i] - low[i]) : 0.5));
+    return { x: [values.map((_, i) => i)], y: [heights] };
+  }
+
+  function mark() {
+    const run = runs[selected.run];
+    Plotly.restyle("front", coordinates(run, selected.point), [report.charts.front.data.length - 1]);
+    const regret = report.charts.regret;
+    if (!regret) return;
+    const last = regret.data.length - 1;
+    const found = regret.data.slice(0, last).flatMap((trace) =>
+      trace.customdata.map((id, i) => [id, trace.x[i], trace.y[i]]));
+    const one = found.find(([id]) => id[0] === selected.run && id[1] === selected.point);
+    Plotly.restyle("regret", one ? { x: [[one[1]]], y: [[one[2]]] } : { x: [[]], y: [[]] }, [last]);
+  }
+
+  function urlOf(one) {
+    if (!one.url) {
+      const bytes = Uint8Array.from(atob(one.video), (character) => character.charCodeAt(0));
+      one.url = URL.createObjectURL(new Blob([bytes], { type: "video/mp4" }));
+    }
+    return one.url;
+  }
+
+  function showFilm() {
+    const run = runs[selected.run];
+    const has = run.films.length > 0;
+    at("film-figure").hidden = !has;
+    at("no-film").hidden = has;
+    at("no-film").textContent = has ? "" : `No films: ${run.no_films}`;
+    document.querySelectorAll(".film-only").forEach((cell) => { cell.hidden = !has; });
+    const next = has ? run.films[nearest(run, selected.point, stops(run))] : null;
+    if (next !== film) {
+      film = next;
+      if (film === null) {
+        at("film").removeAttribute("src");
+      } else {
+        at("film").src = urlOf(film);
+        if (!stillness) at("film").play().catch(() => {}); // It may not be allowed to; there are controls.
+      }
+    }
+    if (film === null) return;
+    const speed = film.speed === null ? "" : `, ${Number(film.speed.toPrecision(2))}× real time`;
+    const whose = film.point === selected.point ? "" : "The nearest filmed preference: ";
+    at("film-caption").textContent = `${whose}${describe(run, film.point)}. ${film.steps.toLocaleString("en")} steps${speed}.`;
+    at("film").setAttribute("aria-label", `Rollout under the preference ${describe(run, film.point)}`);
+  }
+
+  // A row for each objective: its name, its return over the film, so far, of the film, and the mean of the evaluation.
+  function showReturns() {
+    const run = runs[selected.run];
+    const rows = objectives.map((name, i) => {
+      const row = element("tr");
+      row.append(element("th", name, { scope: "row" }));
+      const cell = element("td", undefined, { class: "spark" });
+      if (film !== null) cell.append(sparkline(run, i));
+      row.append(cell);
+      if (film !== null) {
+        row.append(element("td", "0", { class: "now", id: `now-${i}` }), element("td", number(film.total[i])));
+      }
+      const spread = run.spread === null ? "" : ` ± ${number(run.spread[selected.point][i])}`;
+      row.append(element("td", number(run.values[selected.point][i]) + spread));
+      return row;
+    });
+    at("returns").replaceChildren(...rows);
+    const parts = [run.n_episodes === 1 ? "Mean of one episode" : `Mean ± standard deviation of ${run.n_episodes} episodes`];
+    if (run.regrets !== null) parts.push(`preference regret ${number(run.regrets[selected.point])}`);
+    parts.push(run.on_front[selected.point] ? "on the front" : "dominated by another point");
+    at("about-point").textContent = `${parts.join("; ")}.`;
+    tick();
+  }
+
+  function scaleOf(run, i) {
+    const every = run.films.flatMap((one) => one.returns.map((r) => r[i]));
+    const low = every.reduce((a, b) => Math.min(a, b), 0);
+    const high = every.reduce((a, b) => Math.max(a, b), 0);
+    return (x) => 30 - (28 * (x - low)) / (high > low ? high - low : 1);
+  }
+
+  function sparkline(run, i) {
+    const height = scaleOf(run, i);
+    const longest = Math.max(...run.films.map((one) => one.returns.length)) - 1 || 1;
+    const points = film.returns.map((r, k) => `${(100 * k) / longest},${height(r[i]).toFixed(2)}`).join(" ");
+    const picture = svg("svg", { viewBox: "0 0 100 32", preserveAspectRatio: "none", "aria-hidden": "true" });
+    picture.append(
+      svg("line", { x1: 0, x2: 100, y1: height(0), y2: height(0), stroke: "#d9dee3", "vector-effect": "non-scaling-stroke" }),
+      svg("polyline", { points, fill: "none", stroke: run.colour, "stroke-width": 1.5, "vector-effect": "non-scaling-stroke" }),
+      svg("line", { id: `cursor-${i}`, y1: 0, y2: 32, stroke: "#1f2933", "vector-effect": "non-scaling-stroke" }),
+    );
+    picture.dataset.longest = longest;
+    return picture;
+  }
+
+  // The numbers beside the film, in step with it.
+  function tick() {
+    if (film === null) return;
+    const last = film.returns.length - 1;
+    const frame = Math.min(Math.floor(at("film").currentTime * report.fps + 1e-6), last);
+    film.returns[frame].forEach((value, i) => {
+      at(`now-${i}`).textContent = number(value);
+      const cursor = at(`cursor-${i}`);
+      const x = (100 * frame) / Number(cursor.parentNode.dataset.longest);
+      cursor.setAttribute("x1", x);
+      cursor.setAttribute("x2", x);
+    });
+  }
+
+  function everyFrame() {
+    tick();
+    if (!at("film").paused) requestAnimationFrame(everyFrame);
+  }
+
+  function showSlider() {
+    const run = runs[selected.run];
+    const slider = at("preference");
+    slider.max = stops(run).length - 1;
+    slider.value = nearest(run, selected.point, stops(run));
+    slider.setAttribute("aria-valuetext", describe(run, selected.point));
+    at("preference-text").textContent = weights(run, selected.point);
+    at("preference-field").hidden = stops(run).length < 2;
+    const named = objectives.length === 2 && run.preferences !== null;
+    at("end-low").textContent = named ? `← ${objectives[1]}` : "";
+    at("end-high").textContent = named ? `${objectives[0]} →` : "";
+  }
+
+  function markRow() {
+    for (const row of at("points").tBodies[0].rows) {
+      row.toggleAttribute("aria-current", Number(row.dataset.point) === selected.point);
+    }
+  }
+
+  function showTable() {
+    const run = runs[selected.run];
+    const head = element("tr");
+    for (const title of ["Preference", ...objectives, ...(run.regrets === null ? [] : ["Regret"]), ""]) {
+      head.append(element("th", title, { scope: "col" }));
+    }
+    at("points").tHead.replaceChildren(head);
+    const rows = run.values.map((values, point) => {
+      const row = element("tr", undefined, { "data-point": point });
+      row.append(element("th", weights(run, point), { scope: "row" }));
+      for (const value of values) row.append(element("td", number(value)));
+      if (run.regrets !== null) row.append(element("td", number(run.regrets[point])));
+      const button = element("button", "Show", { type: "button", "aria-label": `Show ${describe(run, point)}` });
+      button.addEventListener("click", () => {
+        select(selected.run, point);
+        at("choose").scrollIntoView({ behavior: stillness ? "auto" : "smooth" });
+      });
+      const cell = element("td");
+      cell.append(button);
+      row.append(cell);
+      return row;
+    });
+    at("points").tBodies[0].replaceChildren(...rows);
+  }
+
+  function select(run, point) {
+    const isOther = run !== selected.run;
+    selected.run = run;
+    selected.point = point;
+    at("run").value = String(run);
+    if (isOther) showTable();
+    showSlider();
+    showFilm();
+    showReturns();
+    mark();
+    markRow();
+  }
+
+  function clickable(id) {
+    at(id).on("plotly_click", (event) => {
+      const clicked = event.points.find((one) => one.customdata);
+      if (clicked) select(...clicked.customdata);
+    });
+  }
+
+  function showGrowth() {
+    const { states } = report;
+    const slider = at("growth-step");
+    at("growth-section").hidden = states.length < 2;
+    slider.max = states.length - 1;
+    slider.value = states.length - 1;
+    const show = () => {
+      const state = states[Number(slider.value)];
+      const text = `${state.steps.toLocaleString("en")} steps`;
+      at("growth-text").textContent = text;
+      slider.setAttribute("aria-valuetext", text);
+      Plotly.react("growth", state.data, { ...report.charts.growth.layout, uirevision: "kept" }, config);
+    };
+    let timer = null;
+    const stop = () => {
+      clearInterval(timer);
+      timer = null;
+      at("growth-play").textContent = "Play";
+      at("growth-play").setAttribute("aria-pressed", "false");
+    };
+    slider.addEventListener("input", () => { stop(); show(); });
+    at("growth-play").addEventListener("click", () => {
+      if (timer !== null) return stop();
+      if (Number(slider.value) === states.length - 1) { slider.value = 0; show(); }
+      at("growth-play").textContent = "Pause";
+      at("growth-play").setAttribute("aria-pressed", "true");
+      timer = setInterval(() => {
+        slider.value = Number(slider.value) + 1;
+        show();
+        if (Number(slider.value) === states.length - 1) stop();
+      }, 700);
+    });
+    if (states.length > 1) show();
+  }
+
+  const drawn = Object.entries(report.charts).filter(([name]) => name !== "growth").map(([name, chart]) =>
+    Plotly.newPlot(name, chart.data, chart.layout, config));
+  showGrowth();
+  Promise.all(drawn).then(() => {
+    clickable("front");
+    if (report.charts.regret) clickable("regret");
+    runs.forEach((run, i) => at("run").append(element("option", run.name, { value: i })));
+    at("run-field").hidden = runs.length < 2;
+    at("run").addEventListener("change", () => {
+      const run = runs[Number(at("run").value)];
+      select(Number(at("run").value), Math.min(selected.point, run.values.length - 1));
+    });
+    at("preference").addEventListener("input", () => {
+      select(selected.run, stops(runs[selected.run])[Number(at("preference").value)]);
+    });
+    at("film").addEventListener("play", everyFrame);
+    at("film").addEventListener("seeked", tick);
+    showTable();
+    const first = stops(runs[0]);
+    select(0, first[Math.floor(first.length / 2)]);
+    document.body.dataset.ready = "true";
+  });
+})();
