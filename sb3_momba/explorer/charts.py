@@ -5,7 +5,7 @@ Every string that comes from a record goes through `as_label`: Plotly reads HTML
 """
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ SYMBOLS = ("circle", "square", "diamond", "cross", "x", "circle-open", "square-o
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
 FLOOR_DASHES = ("dot", "dash")
 INK, MUTED, GRID = "#1f2933", "#52606d", "#e4e7eb"
+TICKS = {"separatethousands": True, "exponentformat": "SI"}
 CURVES = {"hypervolume": "Hypervolume", "expected_utility": "Expected utility", "preference_regret": "Preference regret"}
 LONGEST_LABEL = 80
 
@@ -260,19 +261,17 @@ def _front_layout(objectives: Sequence[str], ranges: Array, n_runs: int) -> Char
         axes = [_axis(f"{as_label(name)} (return)", range=limits[k]) for k, name in enumerate(objectives)]
         if n == 2:
             return {**_layout(*axes), **legend}
-        scene = {f"{axis}axis": {**axes[k], "backgroundcolor": "white", "nticks": 5} for k, axis in enumerate("xyz")}
-        camera = {"eye": {"x": 1.5, "y": 1.5, "z": 0.8}}
-        return {
-            **_layout(_axis(""), _axis("")),
-            **legend,
-            "scene": {**scene, "camera": camera, "aspectmode": "cube", "dragmode": "turntable"},
+        scene = {
+            f"{axis}axis": {"title": {"text": as_label(name)}, "range": limits[k], "gridcolor": GRID, "nticks": 5, **TICKS}
+            for k, (axis, name) in enumerate(zip("xyz", objectives, strict=True))
         }
+        view = {"camera": {"eye": {"x": 1.5, "y": 1.5, "z": 0.8}}, "aspectmode": "cube", "dragmode": "turntable"}
+        return {**_layout(_axis(""), _axis("")), **legend, "scene": {**scene, **view}}
     x = _axis("", range=[-0.3, n - 0.7], tickvals=list(range(n)), ticktext=_short_names(objectives), gridcolor="#9aa5b1")
     y = _axis("", range=[-0.12, 1.12], showticklabels=False, showgrid=False)
-    ends: list[Callable[[int], float]] = [lambda k: float(low[k]), lambda k: float(high[k])]
     notes = [
-        {"x": k, "y": end, "text": number(value(k)), "showarrow": False, "yshift": -12 if end == 0 else 12}
-        for end, value in enumerate(ends)
+        {"x": k, "y": end, "text": number(float(bound[k])), "showarrow": False, "yshift": -12 if end == 0 else 12}
+        for end, bound in enumerate((low, high))
         for k in range(n)
     ]
     return {**_layout(x, y), **legend, "annotations": notes}
@@ -284,15 +283,8 @@ def _short_names(objectives: Sequence[str]) -> list[str]:
 
 
 def _axis(title: str, **options: Any) -> Chart:
-    common = {
-        "gridcolor": GRID,
-        "zeroline": False,
-        "linecolor": MUTED,
-        "automargin": True,
-        "separatethousands": True,
-        "exponentformat": "SI",
-    }
-    return {"title": {"text": title, "standoff": 8}, **common, **options}
+    lines = {"gridcolor": GRID, "zeroline": False, "linecolor": MUTED, "automargin": True}
+    return {"title": {"text": title, "standoff": 8}, **lines, **TICKS, **options}
 
 
 def _layout(x: Chart, y: Chart) -> Chart:

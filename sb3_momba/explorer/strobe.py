@@ -22,7 +22,6 @@ from sb3_momba.pareto.plotting import verbatim
 SECONDS = 3.0  # of simulated time: 200 steps of the Humanoid, as in Figure 4.6
 N_PREFERENCES = 4
 WIDTH = 1_600  # pixels
-TALLEST = 800
 SHORTEST = 3.0  # a picture is at least so many times wider than high
 FAINTEST, FADED = 0.12, 0.35  # opacity of the first and of the last but one pose
 
@@ -47,7 +46,8 @@ def draw_strobe(
     preferences: ArrayLike | None = None,
     steps: int | None = None,
     n_poses: int = 8,
-) -> None:
+    width: int = WIDTH,
+) -> list[Strobe]:
     """Write a picture with a row for each preference, all of one scale.
 
     :param folder: of a run
@@ -55,6 +55,8 @@ def draw_strobe(
     :param preferences: (n, n_objectives); by default four, equally spaced
     :param steps: how long each path is; by default 3 s of simulated time
     :param n_poses: how many are drawn along it; the last one is opaque
+    :param width: of each row, in pixels
+    :return: the rows
     :raises ValueError: for a folder that is no run or has no model, a preference off the simplex, or numbers below 1
     :raises RenderingError: if nothing can be drawn here
     """
@@ -75,12 +77,13 @@ def draw_strobe(
         raise RenderingError(f"{run.record.task} has no bodies of MuJoCo: only those can be drawn as strobe pictures.")
     steps = max(1, round(SECONDS / (seconds or SECONDS / 200))) if steps is None else steps
     with RenderingProcess() as process:
-        rows, box = process.call(strobes, run.policy, grid, steps, n_poses, process.backend)
+        rows, box = process.call(strobes, run.policy, grid, steps, n_poses, width, process.backend)
     _write(rows, box, grid, objectives_of(run.record), run.record.task, seconds, path)
+    return rows
 
 
 def strobes(
-    policy: Policy, preferences: NDArray[np.float64], steps: int, n_poses: int, backend: str
+    policy: Policy, preferences: NDArray[np.float64], steps: int, n_poses: int, width: int, backend: str
 ) -> tuple[list[Strobe], tuple[float, float]]:
     """A row for each preference, and from where to where along x, in metres, they all show.
 
@@ -95,10 +98,10 @@ def strobes(
         every.append([_posed(model, states[step]) for step in shown])
         every_last.append(last)
     camera, height, left, right = _view(model, [pose for poses in every for pose in poses])
-    width = max(right - left, SHORTEST * height)
-    left, right = (left + right - width) / 2, (left + right + width) / 2
-    _look_from_afar(model, camera, width, height)
-    stage = Stage(model, WIDTH, min(TALLEST, max(16, round(WIDTH * height / width))), backend, fine=True)
+    length = max(right - left, SHORTEST * height)
+    left, right = (left + right - length) / 2, (left + right + length) / 2
+    _look_from_afar(model, camera, length, height)
+    stage = Stage(model, width, max(16, round(width * height / length)), backend, fine=True)
     rows = []
     for poses, last in zip(every, every_last, strict=True):
         opacities = np.linspace(FAINTEST, FADED, max(len(poses) - 1, 1))

@@ -1,0 +1,206 @@
+"""A report in a browser: opened from disk, used by mouse and by keyboard, on a screen and on a phone's."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from sb3_momba.explorer.report import write_report
+from tests.explorer_runs import chromium, needs_browser, needs_gl, simplex, train_tiny, write_run
+
+OPTIONS = ["--no-sandbox", "--enable-unsafe-swiftshader"]  # as root; 3-D without a graphics card
+TIMEOUT = 120_000  # ms; a busy machine is slow
+PHONE = {"width": 390, "height": 844}
+
+pytestmark = needs_browser
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium() or "chromium", args=OPTIONS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def real_report(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("page")
+    write_report([train_tiny(folder / "run")], folder / "report.html", n_films=3)
+    return folder / "report.html"
+
+
+class Watched:
+    """A page, and what it says and asks for."""
+
+    def __init__(self, browser: Browser, path: Path, **options: Any):
+        self.page: Page = browser.new_page(**options)
+        self.page.set_default_timeout(TIMEOUT)
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text) if message.type == "error" else None)
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("dialog", lambda dialog: self.said.append(dialog.message))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(path.as_uri())
+        self.page.wait_for_selector("body[data-ready]")
+
+    def check(self) -> None:
+        """No error was said, and nothing asked for outside of the file."""
+        assert self.said == []
+        assert [url for url in self.asked if not url.startswith(("data:", "blob:"))] == self.asked[:1]
+
+    def close(self) -> None:
+        """Check, and end."""
+        self.check()
+        self.page.close()
+
+    def overflowing(self) -> list[str]:
+        """What reaches beyond the right edge."""
+        return self.page.evaluate("""
+            () => [document.documentElement, ...document.querySelectorAll("body *")]
+                .filter((one) => one.matches("html") || !one.closest(".scroll, .skip, svg"))
+                .filter((one) => Math.max(one.getBoundingClientRect().right, one.matches("html") ? one.scrollWidth : 0)
+                    > innerWidth + 0.5)
+                .map((one) => `${one.tagName} ${one.id} ${one.className}`)""")
+
+
+def wait_until(page: Page, expression: str) -> None:
+    """Playwright's own way evaluates strings in the page, which the page does not let anyone do."""
+    give_up = time.monotonic() + TIMEOUT / 1_000
+    while not page.evaluate(expression):
+        assert time.monotonic() < give_up, expression
+        page.wait_for_timeout(50)
+
+
+def text(page: Page, selector: str) -> str:
+    return str(page.text_content(selector))
+
+
+@pytest.fixture(scope="module")
+def watched(browser, real_report) -> Iterator[Watched]:
+    watched = Watched(browser, real_report)
+    yield watched
+    watched.close()
+
+
+@pytest.fixture
+def opened(watched) -> Iterator[Page]:
+    """The real report, the middle one of its three films chosen."""
+    for key in ("Home", "ArrowRight"):
+        watched.page.focus("#preference")
+        watched.page.keyboard.press(key)
+    yield watched.page
+    watched.page.evaluate("document.getElementById('film').pause()")  # It costs time.
+    watched.check()
+
+
+@needs_gl
+def test_the_slider_changes_the_film(opened):
+    source, shown = opened.get_attribute("#film", "src"), text(opened, "#film-caption")
+    assert shown.startswith("0.50 forward speed, 0.50 jumping height.")
+    opened.focus("#preference")
+    opened.keyboard.press("ArrowRight")
+    assert opened.get_attribute("#film", "src") != source
+    assert text(opened, "#film-caption").startswith("1.00 forward speed, 0.00 jumping height.")
+    assert text(opened, "#preference-text") == "1.00 / 0.00"
+    assert opened.get_attribute("#preference", "aria-valuetext") == "1.00 forward speed, 0.00 jumping height"
+    opened.keyboard.press("Home")
+    assert text(opened, "#preference-text") == "0.00 / 1.00"
+
+
+@needs_gl
+def test_the_film_plays_and_the_return_runs_with_it(opened):
+    wait_until(opened, "document.getElementById('film').currentTime > 0.1")
+    opened.evaluate("document.getElementById('film').pause()")
+    film = opened.evaluate("JSON.parse(document.getElementById('data').textContent).runs[0].films[1]")
+    assert len(film["returns"]) > 4
+    for frame in (3, 1):
+        seek = f"""new Promise((done) => {{ const film = document.getElementById("film");
+            film.addEventListener("seeked", done, {{ once: true }}); film.currentTime = {(frame + 0.5) / 20}; }})"""
+        opened.evaluate(seek)
+        for i, value in enumerate(film["returns"][frame]):
+            assert float(text(opened, f"#now-{i}").replace(",", "")) == pytest.approx(value, rel=2e-3)
+    seconds = opened.evaluate("document.getElementById('film').duration")
+    assert seconds == pytest.approx(len(film["returns"]) / 20, abs=0.06)
+
+
+def test_a_click_selects_a_point(opened):
+    """Also one that was not filmed: the nearest film is shown, and says so."""
+    point = 1
+    x, y = opened.evaluate(f"""() => {{
+        const chart = document.getElementById("front");
+        const values = JSON.parse(document.getElementById("data").textContent).runs[0].values[{point}];
+        const box = chart.getBoundingClientRect(), {{ xaxis, yaxis }} = chart._fullLayout;
+        return [box.left + xaxis._offset + xaxis.d2p(values[0]), box.top + yaxis._offset + yaxis.d2p(values[1])]; }}""")
+    opened.mouse.click(x, y)
+    opened.wait_for_selector("#preference-text:text-is('0.25 / 0.75')")
+    assert text(opened, "#points tr[aria-current] th") == "0.25 / 0.75"
+    marked = opened.evaluate("(() => { const t = document.getElementById('front').data.at(-1); return [t.x[0], t.y[0]]; })()")
+    values = opened.evaluate(f"JSON.parse(document.getElementById('data').textContent).runs[0].values[{point}]")
+    assert marked == values
+
+
+@needs_gl
+def test_points_are_reached_by_keyboard(opened):
+    opened.focus("#all-title + details > summary")
+    opened.keyboard.press("Enter")
+    opened.focus("#points tr[data-point='3'] button")
+    opened.keyboard.press("Enter")
+    assert text(opened, "#preference-text") == "0.75 / 0.25"
+    assert text(opened, "#film-caption").startswith("The nearest filmed preference: ")
+
+
+def test_the_slider_of_the_training_shows_earlier_fronts(opened):
+    shown = "document.getElementById('growth').data.map((trace) => trace.x)"
+    last = opened.evaluate(shown)
+    assert text(opened, "#growth-text") == "300 steps"
+    opened.focus("#growth-step")
+    opened.keyboard.press("Home")
+    assert text(opened, "#growth-text") == "100 steps"
+    assert opened.evaluate(shown) != last
+
+
+def test_on_a_phone_nothing_overflows(browser, real_report):
+    watched = Watched(browser, real_report, viewport=PHONE)
+    watched.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    assert watched.overflowing() == []
+    columns = watched.page.evaluate("getComputedStyle(document.querySelector('.explore')).gridTemplateColumns")
+    assert len(columns.split()) == 1
+    watched.close()
+
+
+@pytest.mark.parametrize("n_objectives", [1, 3, 10], ids="{} objectives".format)
+def test_other_numbers_of_objectives(n_objectives, browser, tmp_path):
+    preferences = simplex(n_objectives, 6)
+    values = np.random.default_rng(0).normal(0, 100, preferences.shape)
+    folders = [write_run(tmp_path / name, values + k, preferences, label=name) for k, name in enumerate(("one", "another"))]
+    write_report(folders, tmp_path / "report.html")
+    watched = Watched(browser, tmp_path / "report.html", viewport=PHONE)
+    page = watched.page
+    assert text(page, "#no-film") == "No films: The run's folder has no model (model.zip or best_model.zip)."
+    page.select_option("#run", "1")
+    page.focus("#preference")
+    page.keyboard.press("End")
+    expected = values[-1] + 1
+    cells = page.eval_on_selector_all("#returns tr", "(rows) => rows.map((row) => row.lastChild.textContent)")
+    np.testing.assert_allclose([float(cell) for cell in cells], expected, rtol=1e-3)
+    assert page.evaluate("document.getElementById('front').data.at(-1).x.length") == (1 if n_objectives == 3 else n_objectives)
+    assert watched.overflowing() == []
+    watched.close()
+
+
+def test_a_hostile_record_runs_nothing(browser, tmp_path):
+    hostile = "</script><script>alert(1)</script><img src=x onerror=alert(2)><a href='https://a.example'>b</a>"
+    texts = {"label": hostile, "env": hostile, "objectives": [hostile] * 2, "error": hostile}
+    values = np.array([[1.0, 2.0], [2.0, 1.0]])
+    folder = write_run(tmp_path / "run", values, np.eye(2), **texts)
+    write_report([folder], tmp_path / "report.html")
+    watched = Watched(browser, tmp_path / "report.html")
+    assert text(watched.page, "h1") == hostile
+    assert watched.page.eval_on_selector_all("main a, main img, main script, svg a", "(found) => found.length") == 0
+    watched.close()
