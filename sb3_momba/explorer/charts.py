@@ -24,7 +24,7 @@ FLOOR_DASHES = ("dot", "dash")
 INK, MUTED, GRID = "#1f2933", "#52606d", "#e4e7eb"
 TICKS = {"separatethousands": True, "exponentformat": "SI"}
 CURVES = {"hypervolume": "Hypervolume", "expected_utility": "Expected utility", "preference_regret": "Preference regret"}
-LONGEST_LABEL = 80
+LONGEST_LABEL, LONGEST_NAME = 80, 20  # characters
 
 
 def as_label(text: str) -> str:
@@ -87,7 +87,8 @@ def _learning_curve(runs: Sequence[Run], reference_point: Array, metric: str) ->
                 "hovertemplate": f"{number(height)}<extra>%{{fullData.name}}</extra>",
             }
         )
-    layout = _layout(_axis("environment steps", rangemode="tozero"), _axis(""))
+    mode = "nonnegative" if metric == "preference_regret" else "normal"
+    layout = _layout(_axis("environment steps", rangemode="tozero"), _axis("", rangemode=mode))
     return {"data": data, "layout": {**layout, "showlegend": False}}
 
 
@@ -265,9 +266,11 @@ def _front_layout(objectives: Sequence[str], ranges: Array, n_runs: int) -> Char
             f"{axis}axis": {"title": {"text": as_label(name)}, "range": limits[k], "gridcolor": GRID, "nticks": 5, **TICKS}
             for k, (axis, name) in enumerate(zip("xyz", objectives, strict=True))
         }
-        view = {"camera": {"eye": {"x": 1.5, "y": 1.5, "z": 0.8}}, "aspectmode": "cube", "dragmode": "turntable"}
+        camera = {"eye": {"x": 1.65, "y": 1.65, "z": 0.9}, "center": {"x": 0, "y": 0, "z": -0.15}}
+        view = {"camera": camera, "aspectmode": "cube", "dragmode": "turntable"}
         return {**_layout(_axis(""), _axis("")), **legend, "scene": {**scene, **view}}
     x = _axis("", range=[-0.3, n - 0.7], tickvals=list(range(n)), ticktext=_short_names(objectives), gridcolor="#9aa5b1")
+    x["tickangle"] = 0 if n < 5 else -40
     y = _axis("", range=[-0.12, 1.12], showticklabels=False, showgrid=False)
     notes = [
         {"x": k, "y": end, "text": number(float(bound[k])), "showarrow": False, "yshift": -12 if end == 0 else 12}
@@ -278,8 +281,7 @@ def _front_layout(objectives: Sequence[str], ranges: Array, n_runs: int) -> Char
 
 
 def _short_names(objectives: Sequence[str]) -> list[str]:
-    longest = max(8, 72 // len(objectives))
-    return [as_label(name if len(name) <= longest else name[: longest - 1] + "…") for name in objectives]
+    return [as_label(name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…") for name in objectives]
 
 
 def _axis(title: str, **options: Any) -> Chart:
