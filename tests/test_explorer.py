@@ -18,11 +18,12 @@ from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.explorer import charts, report
 from sb3_momba.explorer.__main__ import main
 from sb3_momba.explorer.reading import read_run, read_runs
-from sb3_momba.explorer.rendering import Policy, RenderingProcess, record_episode, stride_of
+from sb3_momba.explorer.rendering import Policy, RenderingProcess, film, record_episode, stride_of
 from sb3_momba.explorer.report import add_films, fill, json_in_html, page_file, spread_out, to_html
 from sb3_momba.explorer.stage import RenderingError, Stage, backends, camera_on, follow
 from sb3_momba.explorer.strobe import draw_strobe
 from tests.explorer_runs import TINY, needs_gl, simplex, train_tiny, write_run
+from tests.stubs import tiny_model
 
 VALUES = np.array([[0.0, 10.0], [6.0, 6.0], [10.0, 0.0]])
 PREFERENCES = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]])
@@ -270,6 +271,23 @@ def test_films_are_in_real_time_unless_they_would_be_too_long():
     assert stride_of(Env(500), 0.05) == 2  # 250 frames
     assert stride_of(Env(1001), 0.05) == 5
     assert stride_of(Env(100), 1.0) == 1
+
+
+def test_an_environment_that_draws_itself_is_filmed_without_opengl(tmp_path):
+    env, path = "Drawing-v0", tmp_path / "model.zip"
+    gym.register(env, entry_point="tests.stubs:StubEnv", max_episode_steps=8, kwargs={"episode_length": 8})
+    try:
+        tiny_model(env).save(path)
+        one = film(Policy(path, env, {}), np.array([0.5, 0.5]), 0, 0, "")
+    finally:
+        del gym.registry[env]
+    # Rewards of the steps 1 to 8 are (t, -10 t).
+    np.testing.assert_array_equal(one.total, [36, -360])
+    np.testing.assert_array_equal(one.returns[:, 0], np.cumsum(range(9)))
+    assert one.steps == 8
+    assert one.stride == 1
+    assert one.speed is None
+    assert one.video[4:8] == b"ftyp"
 
 
 def look_on(task: str, backend: str, n_steps: int) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:

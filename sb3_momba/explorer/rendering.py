@@ -232,8 +232,13 @@ def encode(pictures: Sequence[Image]) -> bytes:
         return Path(path).read_bytes()
 
 
-@lru_cache(maxsize=1)
 def _load(path: Path) -> MOMBA:
+    return _load_version(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _load_version(path: Path, _written: int) -> MOMBA:
+    """Once for all films of a model, and again when its file has changed."""
     return MOMBA.load(path, device="cpu")
 
 
