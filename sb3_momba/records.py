@@ -7,12 +7,13 @@ A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has a
   `general_policy`, `parameters` (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
 - `floor`, one for each policy that learned nothing: `policy`, `values` (n, n_objectives) and the metrics.
 - `evaluation`, one for each point of the curve: `steps`, which rise, `seconds` (of training, without evaluations),
-  `cpu_seconds` (the same, of processor time), `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives).
+  `cpu_seconds` (the same, of processor time), `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives); and
+  `extra_steps` of a method that plays episodes for itself which are not among its `steps`: how many steps they had so far.
 - `resumed`, where the run went on from a checkpoint: its `steps` (evaluations after them were made again, and the later ones
   count), `versions`, `machine`, `git_revision` and `started`.
-- `end`, the last line: `status`. A "finished" run has its `steps` and its final `front`: `returns` and `discounted_returns`
-  (n, episodes, n_objectives), `episode_lengths` (n, episodes), the `preferences` that they answer and its `settings`; one that
-  "failed" has its `error` and, if it failed while it ran, the `traceback`.
+- `end`, the last line: `status`. A "finished" run has its `steps`, perhaps `extra_steps`, and its final `front`: `returns` and
+  `discounted_returns` (n, episodes, n_objectives), `episode_lengths` (n, episodes), the `preferences` that they answer, where
+  they answer any, and its `settings`; one that "failed" has its `error` and, if it failed while it ran, the `traceback`.
 
 Values are mean undiscounted returns. With `general_policy` they are those of one policy under each preference, in their order,
 and n is P; without it they are a set of n solutions, such as the policies of PGMORL, and there is no `preference_regret`.
@@ -102,9 +103,12 @@ class RecordWriter:
             os.ftruncate(self.file.fileno(), size)
             raise
 
-    def finish(self, steps: int, front: dict[str, Any]) -> None:
-        """:param front: the attributes of a ParetoFront"""
-        self.append("end", status="finished", steps=steps, front=front)
+    def finish(self, steps: int, front: dict[str, Any], **content: Any) -> None:
+        """
+        :param front: the attributes of a ParetoFront, or of a set of solutions
+        :param content: of the last line besides
+        """
+        self.append("end", status="finished", steps=steps, **content, front=front)
         self.is_ended = True
 
     def __enter__(self) -> "RecordWriter":

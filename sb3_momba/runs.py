@@ -5,16 +5,17 @@ models, the evaluations, the front's picture, and logs as CSV and for TensorBoar
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat, configure
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.checkpoints.folders import checkpoints_in
@@ -163,24 +164,24 @@ def run(settings: RunSettings, callback: BaseCallback | None = None) -> RunResul
     :param callback: a further one, which changes no result
     """
     folder = Path(settings.output)
-    _check_empty(folder)
+    check_empty(folder)
     with prepared(settings) as ready, alone_in(folder):
-        _check_empty(folder)  # Another run may have come first.
+        check_empty(folder)  # Another run may have come first.
         model, evaluation = ready.model, ready.evaluation
         assert evaluation.eval_env is not None
         sizes = {
             "actor": sum(p.numel() for p in model.actor.parameters()),
             "critic": sum(p.numel() for p in model.critic.parameters()),
         }
-        start = description(settings, ready.preferences, ready.reference_point, sizes)
-        with ready.record.start(**start) as record:
-            for name, front in evaluate_floors(evaluation.eval_env, ready.preferences, settings.n_episodes).items():
-                record.append("floor", policy=name, **front.metrics(ready.reference_point), values=front.values)
+        config = recorded_settings(settings)
+        with ready.record.start(**description(settings, config, ready.preferences, ready.reference_point, sizes)) as record:
+            append_floors(record, evaluation.eval_env, ready.preferences, ready.reference_point, settings.n_episodes)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
             return _train(settings, ready, record, settings.steps, callback)
 
 
-def _check_empty(folder: Path) -> None:
+def check_empty(folder: Path) -> None:
+    """:raises ValueError: for a folder that holds anything, or something that is none"""
     if folder.exists() and (not folder.is_dir() or any(file.name != LOCK for file in folder.iterdir())):
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
 
@@ -236,25 +237,62 @@ def record_failure(settings: RunSettings, error: str) -> None:
     reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives)
     preferences = preferences_of(settings, n_objectives)
     record = RecordWriter(Path(settings.output) / RECORD_NAME)
-    with contextlib.suppress(RuntimeError), record.start(**description(settings, preferences, reference_point, {})):
+    start = description(settings, recorded_settings(settings), preferences, reference_point, {})
+    with contextlib.suppress(RuntimeError), record.start(**start):
         raise RuntimeError(error)
 
 
+class Described(Protocol):
+    """What the first line of a record says of any run's settings."""
+
+    label: str
+    env: str
+    env_kwargs: dict[str, Any]
+    seed: int
+
+
 def description(
-    settings: RunSettings, preferences: np.ndarray, reference_point: Sequence[float], parameters: dict[str, int]
+    settings: Described,
+    config: dict[str, Any],
+    preferences: np.ndarray,
+    reference_point: Sequence[float],
+    parameters: dict[str, int],
+    general_policy: bool = True,
 ) -> dict[str, Any]:
-    """The first line of a run's record."""
+    """The first line of a run's record.
+
+    :param config: every setting of the run, as JSON holds it
+    :param preferences: of the protocol, (P, n_objectives)
+    :param parameters: how many trainable ones each network has
+    :param general_policy: whether one policy answers the preferences
+    """
     return {
         "label": settings.label,
         "env": settings.env,
         "env_kwargs": plain(settings.env_kwargs),
         "seed": settings.seed,
-        "config": recorded_settings(settings),
+        "config": config,
         "reference_point": reference_point,
         "preferences": preferences,
-        "general_policy": True,
+        "general_policy": general_policy,
         "parameters": parameters,
     }
+
+
+def append_floors(
+    record: RecordWriter,
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env],
+    preferences: np.ndarray,
+    reference_point: Sequence[float],
+    n_episodes: int,
+    general_policy: bool = True,
+) -> dict[str, dict[str, float]]:
+    """Measure policies that learned nothing, and append them to a record; their metrics by the policy's name."""
+    measured = {}
+    for name, front in evaluate_floors(env, preferences, n_episodes).items():
+        measured[name] = summarise(front.values, preferences, reference_point, general_policy)
+        record.append("floor", policy=name, **measured[name], values=front.values)
+    return measured
 
 
 def recorded_settings(settings: RunSettings) -> dict[str, Any]:

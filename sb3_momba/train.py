@@ -8,7 +8,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -34,15 +34,21 @@ ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
 
 def report(result: RunResult) -> str:
     """A run's metrics over time beside those of policies that learned nothing, and where its picture is, as text."""
+    picture = result.folder / "front.png"
+    table = metrics_table(result.floors, result.timesteps, result.metrics)
+    return f"{table}\nRun folder: {result.folder}" + (f"   Picture of the front: {picture}" if picture.exists() else "")
+
+
+def metrics_table(
+    floors: Mapping[str, Mapping[str, float]], timesteps: Sequence[int], metrics: Sequence[Mapping[str, float]]
+) -> str:
+    """The metrics of floors, by their names, and over the steps of a training, as text; a set of solutions has no regret."""
     columns = ("steps", "hypervolume", "expected utility", "preference regret")
     lines = ["  ".join(f"{column:>17}" for column in columns)]
-    curve = [(f"{step:,}", m) for step, m in zip(result.timesteps, result.metrics, strict=True)]
-    for name, m in [*result.floors.items(), *curve]:
-        lines.append(
-            f"{name:>17}  {m['hypervolume']:>17,.6g}  {m['expected_utility']:>17,.5g}  {m['preference_regret']:>17,.4g}"
-        )
-    picture = result.folder / "front.png"
-    lines.append(f"Run folder: {result.folder}" + (f"   Picture of the front: {picture}" if picture.exists() else ""))
+    curve = [(f"{step:,}", m) for step, m in zip(timesteps, metrics, strict=True)]
+    for name, m in [*floors.items(), *curve]:
+        regret = f"{m['preference_regret']:.4g}" if "preference_regret" in m else "-"
+        lines.append(f"{name:>17}  {m['hypervolume']:>17,.6g}  {m['expected_utility']:>17,.5g}  {regret:>17}")
     return "\n".join(lines)
 
 

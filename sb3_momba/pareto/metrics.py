@@ -129,15 +129,20 @@ def _largest_lead(leads: Array) -> float:
     return float(-found.fun)
 
 
-def summarise(values: ArrayLike, preferences: ArrayLike, reference_point: ArrayLike) -> dict[str, float]:
+def summarise(
+    values: ArrayLike, preferences: ArrayLike, reference_point: ArrayLike, general_policy: bool = True
+) -> dict[str, float]:
     """The numbers that describe one evaluation, under the names of logs and records.
 
-    :param values: V_w for each preference, in their order, (n_preferences, n_objectives)
+    :param values: V_w for each preference, in their order, (n_preferences, n_objectives); any (n_solutions, n_objectives)
+        without a general policy
+    :param general_policy: whether one policy answers the preferences; a set of solutions answers none, and regrets nothing
     """
+    regret = {"preference_regret": preference_regret(values, preferences)} if general_policy else {}
     return {
         "hypervolume": hypervolume(values, reference_point),
         "expected_utility": expected_utility(values, preferences),
-        "preference_regret": preference_regret(values, preferences),
+        **regret,
         "n_non_dominated": float(non_dominated(values).sum()),
     }
 
