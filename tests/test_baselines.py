@@ -1,0 +1,527 @@
+"""The baselines: PGMORL and GPI-LS by morl-baselines, DPMORL, and the records that all of them leave."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_momba import runs
+from sb3_momba.baselines import dpmorl
+from sb3_momba.baselines import runs as baseline_runs
+from sb3_momba.baselines.__main__ import main, parse
+from sb3_momba.baselines.dpmorl import rollout_steps
+from sb3_momba.baselines.pgmorl import CLIP, EPSILON, schedule
+from sb3_momba.baselines.runs import Baseline, make_baseline, run
+from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
+from sb3_momba.benchmark.__main__ import main as benchmark
+from sb3_momba.envs.pgmorl import TASKS
+from sb3_momba.records import Record, read_record
+from tests.stubs import TINY_SIMBA
+
+EPISODE = 8
+
+
+class Steer(gym.Env):
+    """A point on a line, moved by the action; it earns for being near each of its goals. Counts the steps of all instances."""
+
+    deterministic = True
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+    n_steps: ClassVar[int] = 0
+
+    def __init__(self, n_objectives: int = 2, render_mode: str | None = None):
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.reward_space = spaces.Box(-np.inf, np.inf, (n_objectives,), np.float64)
+        self.goals = np.linspace(-1, 1, n_objectives)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x, self.t = 0.1, 0
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool, dict[str, Any]]:
+        Steer.n_steps += 1
+        self.x, self.t = self.x + 0.3 * float(np.clip(action, -1, 1)[0]), self.t + 1
+        return self._observe(), 4 - np.abs(self.x - self.goals), False, False, {}
+
+    def _observe(self) -> np.ndarray:
+        return np.array([10 * self.x, self.t / EPISODE])
+
+
+for number in (1, 2, 3, 4):
+    gym.register(
+        f"Steer{number}-v0", Steer, max_episode_steps=EPISODE, disable_env_checker=True, kwargs={"n_objectives": number}
+    )
+
+ENV = "Steer2-v0"
+TINY = {
+    "pgmorl": {"steps_per_iteration": 16, "num_envs": 2, "num_minibatches": 2, "delta_weight": 1 / 3, "net_arch": [8]},
+    "gpi_ls": {"timesteps_per_iter": 40, "gradient_updates": 1, "buffer_size": 500, "learning_starts": 20, "net_arch": [8, 8]},
+    "dpmorl": {"n_policies": 4, "n_envs": 2, "n_steps": 8, "random_episodes": 3, "net_arch": [8]},
+}
+STEPS = {"pgmorl": 640, "gpi_ls": 120, "dpmorl": 256}  # 640 = 5 iterations of 16 steps of 2 environments for 4 policies
+SMALL = {"eval_freq": 100, "n_preferences": 5, "n_episodes": 2, "seed": 3, "device": "cpu"}
+
+
+def settings_of(algorithm: str, folder: Path, **changed: Any) -> BaselineSettings:
+    given = {"env": ENV, "steps": STEPS[algorithm], "hyperparameters": dict(TINY[algorithm]), **SMALL, **changed}
+    return BaselineSettings(algorithm, output=str(folder), **given)
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_wandb() -> Iterator[None]:
+    """morl-baselines imports it; nothing may ever call it."""
+    import wandb
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("W&B was called.")
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("init", "log", "finish", "login", "setup", "define_metric"):
+            patch.setattr(wandb, name, refuse)
+        yield
+
+
+def run_once(algorithm: str, folder: Path) -> SimpleNamespace:
+    """A run, and the algorithm that it trained."""
+    settings = settings_of(algorithm, folder)
+    made: list[Any] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baseline_runs, "make_baseline", lambda *args: made.append(make_baseline(*args)) or made[0])
+        result = run(settings)
+    path = folder / "record.jsonl"
+    lines = lines_of(path)
+    return SimpleNamespace(settings=settings, result=result, lines=lines, record=read_record(path), trained=made[0])
+
+
+@pytest.fixture(scope="module", params=ALGORITHMS)
+def tiny(request, tmp_path_factory) -> SimpleNamespace:
+    """One run of each baseline."""
+    return run_once(request.param, tmp_path_factory.mktemp(request.param) / "run")
+
+
+# ------------------------------------------------------------------------------------------------------------ records
+
+
+def test_a_record_says_what_was_run(tiny) -> None:
+    algorithm, record = tiny.settings.algorithm, tiny.record
+    assert (record.label, record.env, record.seed, record.env_kwargs) == (algorithm, ENV, 3, {})
+    assert record.general_policy is (algorithm == "gpi_ls")
+    assert record.preferences.tolist() == [[w, 1 - w] for w in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    assert record.reference_point.tolist() == [0, 0]
+    assert (record.config["algorithm"], record.config["steps"], record.config["n_episodes"]) == (algorithm, STEPS[algorithm], 2)
+    assert "output" not in record.config
+    chosen = record.config["hyperparameters"]
+    assert {name: chosen[name] for name in TINY[algorithm]} == TINY[algorithm]
+    assert chosen["learning_rate"] == 3e-4
+    assert record.error is None
+
+
+def test_a_record_has_floors_and_a_curve(tiny) -> None:
+    record, is_general = tiny.record, tiny.record.general_policy
+    assert [floor.policy for floor in record.floors] == ["standing still", "random actions"]
+    still = EPISODE * (4 - np.abs(0.1 - np.array([-1, 1])))
+    np.testing.assert_allclose(record.floors[0].values, [still] * 5)
+    events = [line for line in tiny.lines if line["event"] == "evaluation"]
+    steps = [event["steps"] for event in events]
+    assert steps == tiny.result.timesteps == sorted(set(steps))
+    assert len(steps) >= 2
+    assert steps[0] >= 100
+    assert steps[-1] == tiny.lines[-1]["steps"] == STEPS[tiny.settings.algorithm]
+    for event in events:
+        assert ("preference_regret" in event) is is_general
+        assert len(event["values"]) == 5 or not is_general
+        assert min(event["seconds"], event["cpu_seconds"], event["evaluation_seconds"]) >= 0
+    extra = [event["extra_steps"] for event in events]
+    assert extra == sorted(extra)
+    assert extra[-1] == tiny.lines[-1]["extra_steps"]
+    np.testing.assert_allclose(record.final_values, record.evaluations[-1].values)
+
+
+def test_one_episode_stands_for_all_where_nothing_is_random(tiny) -> None:
+    front = tiny.lines[-1]["front"]
+    n = 5 if tiny.record.general_policy else len(tiny.record.final_values)
+    assert np.shape(front["returns"]) == np.shape(front["discounted_returns"]) == (n, 1, 2)
+    assert front["episode_lengths"] == [[EPISODE]] * n
+    assert (front["settings"]["deterministic_policy"], front["settings"]["deterministic_env"]) == (True, True)
+
+
+def test_values_are_raw_returns(tiny) -> None:
+    """Within what this task can give, which normalised, clipped or discounted returns are not."""
+    values = tiny.record.final_values
+    total = EPISODE * (8 - 2)  # both distances add up to 2 between the goals, and to more beyond
+    assert (values.sum(axis=1) <= total + 1e-9).all()
+    assert (values > EPISODE * 0.5).all()
+
+
+def test_the_same_seed_gives_the_same_record(tiny, tmp_path) -> None:
+    def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        drop = ("seconds", "cpu_seconds", "evaluation_seconds", "started")
+        return [{name: value for name, value in line.items() if name not in drop} for line in lines]
+
+    again = run_once(tiny.settings.algorithm, tmp_path / "again")
+    assert without_times(again.lines) == without_times(tiny.lines)
+
+
+def test_the_report_takes_them_beside_a_record_of_momba(tmp_path_factory, tmp_path, capsys) -> None:
+    hyperparameters = {"learning_starts": 20, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
+    shared = {"n_preferences": 5, "n_episodes": 2, "seed": 3, "device": "cpu"}
+    runs.run(
+        runs.RunSettings(ENV, str(tmp_path / "momba"), steps=60, hyperparameters=hyperparameters, progress_bar=False, **shared)
+    )
+    for algorithm in ("gpi_ls", "dpmorl"):
+        run(settings_of(algorithm, tmp_path / algorithm, label=f"{algorithm}_mine"))
+    benchmark(["report", str(tmp_path)])
+    said = capsys.readouterr().out
+    for name in ("momba", "gpi_ls_mine", "dpmorl_mine", "standing still"):
+        assert name in said
+
+
+def test_the_report_takes_each(tiny, capsys, tmp_path) -> None:
+    benchmark(["report", tiny.settings.output, "--output", str(tmp_path / "report")])
+    assert tiny.settings.algorithm in capsys.readouterr().out
+
+
+# --------------------------------------------------------------------------------------------------------- evaluation
+
+
+def roll_out(act: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """The return of one episode of the raw task, (2,).
+
+    :param act: (observation, return so far) -> action
+    """
+    env = gym.make(ENV)
+    observation, _ = env.reset(seed=0)
+    total, ended = np.zeros(2), False
+    while not ended:
+        observation, reward, terminated, truncated, _ = env.step(act(observation, total))
+        total, ended = total + reward, terminated or truncated
+    return total
+
+
+def by_hand(trained: Any, algorithm: str) -> list[np.ndarray]:
+    """The returns of the policies, rolled out one by one with the networks themselves."""
+    if algorithm == "gpi_ls":
+        networks = [(trained.agent.policy, th.tensor([w, 1 - w])) for w in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        return [
+            roll_out(lambda s, z, n=net, w=w: n(th.tensor(s).float()[None], w[None]).detach().numpy()[0]) for net, w in networks
+        ]
+    if algorithm == "pgmorl":
+        found = []
+        assert [one.policy for one in trained.archived.values()] == trained.agent.archive.individuals
+        pairs = [(one.policy, one.statistics) for one in trained.archived.values()]
+        for policy, statistics in [*pairs, *((policy, trained.statistics) for policy in trained.agent.agents)]:
+
+            def act(s: np.ndarray, z: np.ndarray, net: Any = policy.networks.actor_mean, of: Any = statistics) -> np.ndarray:
+                normalized = np.clip((s - of.mean) / np.sqrt(of.variance + EPSILON), -CLIP, CLIP)
+                return np.clip(net(th.tensor(normalized).float()[None]).detach().numpy()[0], -1, 1)
+
+            found.append(roll_out(act))
+        return found
+    raise AssertionError(algorithm)
+
+
+def test_an_evaluation_is_a_rollout_by_hand(tiny) -> None:
+    trained = tiny.trained
+    values = trained.evaluate(tiny.record.preferences).values
+    np.testing.assert_allclose(values, tiny.record.final_values)
+    if tiny.settings.algorithm != "dpmorl":  # Its policies are not at hand: see the next test.
+        np.testing.assert_allclose(values, by_hand(trained, tiny.settings.algorithm), rtol=1e-5)
+
+
+def test_an_evaluation_of_dpmorl_shows_its_policies_their_returns(tmp_path) -> None:
+    made = make_baseline(settings_of("dpmorl", tmp_path), 2)
+    made.low, made.high = np.array([-1.0, 0.0]), np.array([3.0, 50.0])
+    made.model.num_timesteps = 8
+
+    def act(s: np.ndarray, z: np.ndarray) -> np.ndarray:
+        shown = np.concatenate([s, [(z[0] + 1) / 4, z[1] / 50]]).astype(np.float32)
+        return made.model.predict(shown, deterministic=True)[0]
+
+    np.testing.assert_allclose(made.evaluate(np.eye(2)).values, [roll_out(act)], rtol=1e-5)
+    made.close()
+
+
+def test_the_statistics_of_pgmorl_are_of_all_its_environments(tiny) -> None:
+    trained = tiny.trained
+    if tiny.settings.algorithm != "pgmorl":
+        assert not hasattr(trained, "statistics")
+        return
+    seen = [env.get_wrapper_attr("obs_rms") for env in trained.agent.env.envs]
+    counts = np.array([one.count for one in seen])
+    mean = np.average([one.mean for one in seen], axis=0, weights=counts)
+    squares = np.average([one.var + one.mean**2 for one in seen], axis=0, weights=counts)
+    np.testing.assert_allclose(trained.statistics.mean, mean)
+    np.testing.assert_allclose(trained.statistics.variance, squares - mean**2)
+    assert counts.sum() > STEPS["pgmorl"]  # resets are seen too
+
+
+def test_steps_of_the_algorithms_own_episodes_are_counted(tmp_path) -> None:
+    made = make_baseline(settings_of("gpi_ls", tmp_path), 2)
+    before = Steer.n_steps
+    made.train(lambda: None)
+    assert made.steps == 120
+    assert made.extra_steps > 0
+    assert made.extra_steps % (5 * EPISODE) == 0  # five episodes for each
+    assert Steer.n_steps - before == made.steps + made.extra_steps
+    made.close()
+
+
+def test_the_extra_steps_by_hand(tiny) -> None:
+    algorithm, extra = tiny.settings.algorithm, tiny.lines[-1]["extra_steps"]
+    if algorithm == "pgmorl":  # 4 policies, 5 episodes each: at the start, after the warm-up, after the one generation
+        assert extra == 3 * 4 * 5 * EPISODE
+    if algorithm == "dpmorl":  # of random actions
+        assert extra == 3 * EPISODE
+
+
+# ---------------------------------------------------------------------------------------------------- tasks and sizes
+
+
+@pytest.fixture(scope="module", params=ALGORITHMS)
+def of_all_tasks(request, tmp_path_factory) -> tuple[str, dict[str, Baseline]]:
+    """Each baseline on each task, in networks of its own size."""
+    small: dict[str, dict[str, Any]] = {
+        "pgmorl": {"num_envs": 1, "steps_per_iteration": 32, "num_minibatches": 4},
+        "gpi_ls": {"buffer_size": 100},
+        "dpmorl": {"n_envs": 1, "augment_state": False},
+    }
+    algorithm, made = request.param, {}
+    for task in TASKS:
+        n_objectives = 3 if "3obj" in task else 2
+        steps = {"pgmorl": 5 * 32 * (15 if n_objectives == 3 else 6)}.get(algorithm, 10_000)
+        settings = settings_of(algorithm, tmp_path_factory.mktemp("x"), env=task, steps=steps)
+        settings.hyperparameters = small[algorithm]
+        made[task] = make_baseline(settings, n_objectives)
+    yield algorithm, made
+    for one in made.values():
+        one.close()
+
+
+def test_networks_are_as_large_as_the_thesis_says(of_all_tasks) -> None:
+    """Table 4.2, the average of the tasks; DPMORL's are those of states without the return so far."""
+    algorithm, made = of_all_tasks
+    assert len(made) == 7
+    sizes = [sum(one.parameters.values()) for one in made.values()]
+    assert round(np.mean(sizes)) == {"pgmorl": 17_551, "gpi_ls": 259_119, "dpmorl": 17_477}[algorithm]
+
+
+def test_each_task_has_actions_for_its_start(of_all_tasks) -> None:
+    algorithm, made = of_all_tasks
+    for task, one in made.items():
+        env = gym.make(task)
+        n = env.unwrapped.reward_space.shape[0]
+        s = np.concatenate([env.reset(seed=0)[0], np.full(n, 1 / n)])[None].astype(np.float32)
+        if algorithm == "gpi_ls":
+            actions = one.policy.predict(s)[0]
+        elif algorithm == "pgmorl":
+            actions = one.agent.agents[-1].networks.actor_mean(th.tensor(s[:, :-n])).detach().numpy()
+            assert len(one.agent.agents) == one.hyperparameters["pop_size"] == (15 if n == 3 else 6)
+        else:
+            actions = dpmorl.PolicyOfReturns(one.model.policy, n).predict(s)[0]
+        assert actions.shape == (1, *env.action_space.shape)
+        assert np.isfinite(actions).all()
+
+
+# ---------------------------------------------------------------------------------------------------------- schedules
+
+
+@pytest.mark.parametrize(
+    ("iterations", "expected"),
+    [(5, (4, 1)), (12, (4, 1)), (20, (8, 2)), (61, (25, 6)), (100, (37, 9)), (240, (80, 20)), (244, (84, 20)), (610, (90, 20))],
+    ids=lambda x: str(x).replace(", ", "+"),
+)
+def test_the_schedule_of_pgmorl(iterations: int, expected: tuple[int, int]) -> None:
+    warmup, generation = schedule(iterations * 49_152, 49_152, None, None)
+    assert (warmup, generation) == expected
+    assert (iterations - warmup) % generation == 0
+
+
+def test_a_given_schedule_of_pgmorl() -> None:
+    assert schedule(4_915_200, 49_152, 80, 20) == (80, 20)
+    assert schedule(10 * 48, 48, 4, None) == (4, 1)
+    assert schedule(10 * 48, 48, None, 2) == (8, 2)
+
+
+def test_a_schedule_fills_every_number_of_iterations() -> None:
+    for n in range(5, 500):
+        warmup, generation = schedule(n, 1, None, None)
+        assert warmup >= 4 * generation
+        assert 1 <= (n - warmup) // generation <= max(8, (n - 80) // 20)
+
+
+@pytest.mark.parametrize(
+    ("steps", "given", "message"),
+    [
+        (100_000, (None, None), r"49,152 steps.*give 98,304 \(2\) or 147,456 \(3\)"),
+        (10_000, (None, None), r"give 49,152 \(1\)\.$"),
+        (98_304, (None, None), r"2 iterations of 49,152: behind a warm-up of 4 .* generations of 1.* Give 245,760 \(5\)"),
+        (491_520, (80, 20), r"10 iterations .* warm-up of 80 .* Give 4,915,200 \(100\)"),
+        (5_013_504, (80, 20), r"102 iterations .* Give 4,915,200 \(100\)"),
+    ],
+    ids=range(5),
+)
+def test_steps_that_pgmorl_cannot_divide_are_refused(steps: int, given: tuple[Any, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        schedule(steps, 49_152, *given)
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"), [(10_000_000, 2000), (1_000_000, 200), (100_000, 20), (100_000_000, 2000)], ids=str
+)
+def test_rollouts_of_dpmorl(steps: int, expected: int) -> None:
+    n_steps = rollout_steps(steps, 10, 20, None)
+    assert n_steps == expected
+    assert steps % (10 * 20 * n_steps) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1_001, 10, 20, None), r"n_policies=10, each with n_envs=20.* multiple of 200, such as 1,000 or 1,200"),
+        ((1_000_000, 10, 20, 2048), r"n_steps=2048: .* 1,000,000 / 10 / 20 = 5,000 steps"),
+        ((200 * 5003, 10, 20, None), r"5,003 steps, which no rollout of about 200 divides: set n_steps"),
+        ((10, 10, 1, 1), r"at least two transitions"),
+    ],
+    ids=range(4),
+)
+def test_steps_that_dpmorl_cannot_divide_are_refused(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rollout_steps(*arguments)
+
+
+# --------------------------------------------------------------------------------------------------------- command line
+
+
+def test_the_command_line() -> None:
+    words = "gpi_ls --env MO-Hopper-v4 --steps 2e5 --seed 4 --output here --label gpi_ls_utd_1 --eval-freq 1e4 --n-episodes 3"
+    settings = parse([*words.split(), "--set", "gradient_updates=1", "--set", "learning_rate=1e-3"])
+    assert settings == BaselineSettings(
+        "gpi_ls",
+        "MO-Hopper-v4",
+        "here",
+        200_000,
+        seed=4,
+        label="gpi_ls_utd_1",
+        hyperparameters={"gradient_updates": 1, "learning_rate": 1e-3},
+        eval_freq=10_000,
+        n_episodes=3,
+    )
+    short = parse(["dpmorl", "--env", "MO-Hopper-v4", "--steps", "1e6"])
+    assert short.label == "dpmorl"
+    assert short.output.startswith("runs/MO-Hopper-v4/dpmorl-")
+
+
+def command(algorithm: str, folder: Path, *more: str) -> list[str]:
+    words = [algorithm, "--env", ENV, "--steps", str(STEPS[algorithm]), "--output", str(folder), "--device", "cpu"]
+    words += ["--n-preferences", "5", "--n-episodes", "2", "--seed", "3"]
+    tiny = [word for name, value in TINY[algorithm].items() for word in ("--set", f"{name}={value}")]
+    return [*words, *tiny, *more]
+
+
+def test_a_command_trains_and_prints_its_curve(tmp_path, capsys) -> None:
+    main(command("dpmorl", tmp_path / "run", "--label", "mine"))
+    said = capsys.readouterr().out
+    assert "standing still" in said
+    assert str(tmp_path / "run") in said
+    assert read_record(tmp_path / "run" / "record.jsonl").label == "mine"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "more", "message"),
+    [
+        ("pgmorl", "--set pop_sise=4", r"pgmorl has no hyperparameter 'pop_sise'; it takes anneal_lr, .*pop_size"),
+        ("gpi_ls", "--set pop_size=4", r"gpi_ls has no hyperparameter 'pop_size'; it takes .*gradient_updates"),
+        ("dpmorl", "--set gradient_updates=4", r"dpmorl has no hyperparameter .* it takes .*n_policies"),
+        ("gpi_ls", "--set dyna=true", "no hyperparameter 'dyna'"),
+        ("gpi_ls", "--set log=true", "no hyperparameter 'log'"),
+        ("gpi_ls", "--set gradient_updates=0", "gradient_updates=0: it must be a whole number of at least 1"),
+        ("gpi_ls", "--set per=1", "per=1: it is a switch"),
+        ("gpi_ls", "--set learning_rate=fast", "learning_rate='fast': give a finite number"),
+        ("gpi_ls", "--set net_arch=64", r"net_arch=64: give a list such as \[256, 256\]"),
+        ("gpi_ls", "--steps 130", "steps=130 is no whole number of iterations of 40: give 120 or 160"),
+        ("gpi_ls", "--steps 30", "steps=30 .*: give 40, or"),
+        ("pgmorl", "--steps 1000", r"1,000 is no whole number .* 128 steps .*: give 896 \(7\) or 1,024 \(8\)"),
+        ("pgmorl", "--set pop_size=6", "pop_size=6: delta_weight=.* gives 4 weights"),
+        ("pgmorl", "--set delta_weight=0.5", "gives 3 weights: PGMORL predicts from 4 policies"),
+        ("pgmorl", "--set delta_weight=0", "delta_weight=0: give"),
+        ("pgmorl", "--set num_minibatches=3", "num_minibatches=3: .* = 32"),
+        ("pgmorl", "--env Steer4-v0", "has 4 objectives: PGMORL takes two or three"),
+        ("dpmorl", "--steps 257", "multiple of 8, such as 256 or 264"),
+        ("dpmorl", "--set linear_share=0", "linear_share=0"),
+        ("dpmorl", "--env Steer1-v0", "has one objective"),
+        ("dpmorl", "--env MO-Hoper-v4", "Did you mean"),
+        ("dpmorl", "--eval-freq 0", "eval_freq=0"),
+        ("dpmorl", "--seed -1", "seed=-1"),
+        ("dpmorl", "--n-episodes 0", "n_episodes=0"),
+        ("dpmorl", "--reference-point 0 0 0", "reference point"),
+        ("dpmorl", "--set n_policies", "write NAME=VALUE"),
+    ],
+    ids=range(26),
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path, algorithm: str, more: str, message: str, capfd) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(SystemExit) as refused:
+        main(command(algorithm, folder, *more.split()))
+    with pytest.raises(AssertionError, match=message):  # for its searching message
+        raise AssertionError(str(refused.value))
+    assert not folder.exists()
+
+
+def test_a_baseline_that_is_none_is_refused(tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        parse(["capql", "--env", ENV, "--steps", "1"])
+    assert "'pgmorl', 'gpi_ls', 'dpmorl'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="no baseline 'gpi-ls': did you mean 'gpi_ls'"):
+        run(BaselineSettings("gpi-ls", ENV, str(tmp_path / "run"), 100))
+
+
+def test_a_used_folder_is_refused_and_stays(tiny) -> None:
+    record = Path(tiny.settings.output) / "record.jsonl"
+    before = record.read_bytes()
+    with pytest.raises(ValueError, match="not an empty folder"):
+        run(tiny.settings)
+    assert record.read_bytes() == before
+
+
+def test_a_run_that_fails_says_so_in_its_record(tmp_path, monkeypatch) -> None:
+    def fail(*args: Any) -> None:
+        raise RuntimeError("no utilities")
+
+    monkeypatch.setattr(dpmorl, "generate_utilities", fail)
+    with pytest.raises(RuntimeError, match="no utilities"):
+        run(settings_of("dpmorl", tmp_path / "run"))
+    record: Record = read_record(tmp_path / "run" / "record.jsonl")
+    assert record.error == "RuntimeError: no utilities"
+    assert lines_of(tmp_path / "run" / "record.jsonl")[-1]["status"] == "failed"
+
+
+@pytest.mark.parametrize("algorithm", ["pgmorl", "gpi_ls"])
+def test_without_its_extra_a_baseline_names_it(tmp_path, monkeypatch, algorithm: str) -> None:
+    for name in ("multi_policy.pgmorl.pgmorl", "multi_policy.gpi_pd.gpi_pd_continuous_action"):
+        monkeypatch.setitem(sys.modules, f"morl_baselines.{name}", None)
+    with pytest.raises(ImportError, match=r'pip install "sb3-momba\[baselines\]"'):
+        run(settings_of(algorithm, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_only_its_adapters_need_the_library() -> None:
+    script = (
+        "import sys, sb3_momba.baselines.__main__, sb3_momba.baselines.dpmorl, sb3_momba.baselines.pgmorl\n"
+        "import sb3_momba.baselines.gpi_ls\n"
+        "print(sorted({'morl_baselines', 'wandb'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip() == "[]"
