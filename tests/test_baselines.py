@@ -176,6 +176,14 @@ def test_the_same_seed_gives_the_same_record(tiny, tmp_path) -> None:
     assert without_times(again.lines) == without_times(tiny.lines)
 
 
+@pytest.mark.parametrize("algorithm", ["gpi_ls", "dpmorl"])
+def test_evaluations_do_not_change_the_training(tmp_path, algorithm: str) -> None:
+    often, never = (run(settings_of(algorithm, tmp_path / str(n), eval_freq=n)) for n in (20, 10_000))
+    assert len(often.timesteps) >= 4
+    assert len(never.timesteps) == 1
+    assert often.metrics[-1] == never.metrics[-1]
+
+
 def test_the_report_takes_them_beside_a_record_of_momba(tmp_path_factory, tmp_path, capsys) -> None:
     hyperparameters = {"learning_starts": 20, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
     shared = {"n_preferences": 5, "n_episodes": 2, "seed": 3, "device": "cpu"}
@@ -469,8 +477,11 @@ def test_a_command_trains_and_prints_its_curve(tmp_path, capsys) -> None:
         ("dpmorl", "--n-episodes 0", "n_episodes=0"),
         ("dpmorl", "--reference-point 0 0 0", "reference point"),
         ("dpmorl", "--set n_policies", "write NAME=VALUE"),
+        ("dpmorl", "--set gamma=1.5", "gamma=1.5: it must be from 0 to 1"),
+        ("dpmorl", "--set batch_size=1", "batch_size=1: it must be a whole number of at least 2"),
+        ("dpmorl", "--set n_steps=2.5", "n_steps=2.5: it must be a whole number"),
     ],
-    ids=range(26),
+    ids=range(29),
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path, algorithm: str, more: str, message: str, capfd) -> None:
     folder = tmp_path / "run"

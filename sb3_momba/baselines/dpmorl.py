@@ -7,6 +7,8 @@ dominates are the solutions.
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -25,6 +27,7 @@ from sb3_momba.envs.registry import raw_id
 from sb3_momba.envs.wrappers import make_env
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front, probe_environment
 from sb3_momba.pareto.floors import RandomPolicy
+from sb3_momba.settings import check_whole
 
 OF_PPO: dict[str, Any] = {
     "n_epochs": 5,
@@ -91,6 +94,8 @@ def rollout_steps(steps: int, n_policies: int, n_envs: int, n_steps: int | None)
             f"steps={steps:,} do not divide among n_policies={n_policies}, each with n_envs={n_envs} environments: give a "
             f"multiple of {step:,}, such as {near}."
         )
+    if n_steps is not None:
+        check_whole("n_steps", n_steps, 1)
     of_env = steps // n_policies // n_envs
     shares = f"each of the {n_envs} environments of a policy has {steps:,} / {n_policies} / {n_envs} = {of_env:,} steps"
     if n_steps is None:
@@ -120,7 +125,7 @@ class Baseline:
             raise ValueError(f"linear_share={chosen['linear_share']}: give a share above 0 and up to 1.")
         n_policies, n_envs = chosen["n_policies"], chosen["n_envs"]
         chosen["n_steps"] = rollout_steps(settings.steps, n_policies, n_envs, chosen["n_steps"])
-        self.finished: list[ParetoFront] = []
+        self.finished: list[Trained] = []
         self.finished_steps = self.extra_steps = 0
         # Any range will do for a model that is not trained, and only shows what can be built.
         self.low, self.high = np.zeros(n_objectives), np.ones(n_objectives)
@@ -138,14 +143,14 @@ class Baseline:
         """Of the training, so far."""
         return self.finished_steps + self.model.num_timesteps
 
-    def _augmented(self) -> gym.Env:
+    def _augmented(self, low: np.ndarray, high: np.ndarray) -> gym.Env:
         env = make_env(raw_id(self.settings.env))
-        return AccumulatedReturn(env, self.low, self.high, self.hyperparameters["augment_state"])
+        return AccumulatedReturn(env, low, high, self.hyperparameters["augment_state"])
 
     def _make_model(self, index: int, utility: th.nn.Module) -> PPO:
         of_returns = UtilityOfReturns(utility, th.from_numpy(self.low), th.from_numpy(self.high))
         chosen = self.hyperparameters
-        venv = DummyVecEnv([lambda: WithoutReward(self._augmented())] * chosen["n_envs"])
+        venv = DummyVecEnv([lambda: WithoutReward(self._augmented(self.low, self.high))] * chosen["n_envs"])
         self.venv = UtilityReward(venv, of_returns, self.n_objectives)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "You have specified a mini-batch size")  # The last one may be smaller.
@@ -169,7 +174,7 @@ class Baseline:
             self.venv.close()
             self.model = self._make_model(index, utility)
             self.model.learn(self.settings.steps // len(utilities), callback=BetweenRollouts(between_steps))
-            self.finished.append(self._play())
+            self.finished.append(Trained(self.model.policy, self.low, self.high))
             self.finished_steps, self.model.num_timesteps = self.steps, 0
             # A utility stays what it is while a policy is trained for it; the next one covers what was seen until then.
             self.low, self.high = np.minimum(self.low, self.venv.low), np.maximum(self.high, self.venv.high)
@@ -192,16 +197,32 @@ class Baseline:
 
         :param preferences: which no policy answers
         """
-        current = [self._play()] if self.model.num_timesteps else []
-        played = [*self.finished, *current]
+        current = [Trained(self.model.policy, self.low, self.high)] if self.model.num_timesteps else []
+        played = [self._play(one) for one in (*self.finished, *current)]
         kept = non_dominated_distributions(np.concatenate([one.returns for one in played]))
         return as_set([played[i] for i in kept], utilities=kept)
 
-    def _play(self) -> ParetoFront:
-        policy = PolicyOfReturns(self.model.policy, self.n_objectives)
-        gamma = self.hyperparameters["gamma"]
-        return evaluate_policy(policy, self._augmented, self.n_objectives, self.settings.n_episodes, gamma)
+    def _play(self, one: "Trained") -> ParetoFront:
+        if one.played is None:
+            one.played = evaluate_policy(
+                PolicyOfReturns(one.policy, self.n_objectives),
+                partial(self._augmented, one.low, one.high),
+                self.n_objectives,
+                self.settings.n_episodes,
+                self.hyperparameters["gamma"],
+            )
+        return one.played
 
     def close(self) -> None:
         """Close the environments."""
         self.venv.close()
+
+
+@dataclass
+class Trained:
+    """A policy, with the range that its observations show returns in; `played` is what it earned, once that is known."""
+
+    policy: Any
+    low: np.ndarray
+    high: np.ndarray
+    played: ParetoFront | None = None

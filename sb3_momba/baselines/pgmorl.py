@@ -217,20 +217,17 @@ class Baseline:
         :param preferences: which no policy answers
         """
         archive = list(self.archived.values())
-        current = [Archived(policy, self.statistics) for policy in self.agent.agents]
-        for one in (*archive, *current):
-            if one.played is None:
-                one.played = self._play(one)
-        played = [one.played for one in (*archive, *current) if one.played is not None]
-        weights = [one.policy.weights.tolist() for one in (*archive, *current)]
-        return as_set(played, archived=len(archive), weights=weights)
+        policies = [*archive, *(Archived(policy, self.statistics) for policy in self.agent.agents)]
+        weights = [one.policy.weights.tolist() for one in policies]
+        return as_set([self._play(one) for one in policies], archived=len(archive), weights=weights)
 
     def _play(self, one: "Archived") -> ParetoFront:
-        agent = self.agent
-        policy = NormalizedPolicy(
-            one.policy.networks.actor_mean, one.statistics, self.n_objectives, agent.action_space, agent.device
-        )
-        return evaluate_policy(policy, self.settings.env, self.n_objectives, self.settings.n_episodes, agent.gamma)
+        if one.played is None:
+            agent = self.agent
+            network = one.policy.networks.actor_mean
+            policy = NormalizedPolicy(network, one.statistics, self.n_objectives, agent.action_space, agent.device)
+            one.played = evaluate_policy(policy, self.settings.env, self.n_objectives, self.settings.n_episodes, agent.gamma)
+        return one.played
 
     def close(self) -> None:
         """Close the environments."""

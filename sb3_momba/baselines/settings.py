@@ -6,10 +6,10 @@ from typing import Any
 
 from sb3_momba.pareto import protocol
 from sb3_momba.records import plain
-from sb3_momba.settings import check_switch, check_whole, is_number
+from sb3_momba.settings import RANGES, check_switch, check_whole, is_number
 
 ALGORITHMS = ("pgmorl", "gpi_ls", "dpmorl")
-LEAST = {"learning_starts": 0}  # of whole numbers that may be less than 1
+LEAST = {"learning_starts": 0, "batch_size": 2}  # of whole numbers; 1 of others
 NOT_RECORDED = ("output",)  # No result depends on it.
 
 
@@ -80,3 +80,5 @@ def _check_kind(name: str, value: Any, default: Any) -> None:
             check_whole(name, entry, 1)
     elif not (is_number(value) or (default is None and value is None)):
         raise ValueError(f"{name}={value!r}: give a finite number.")
+    elif name in RANGES and not RANGES[name][0] <= value <= RANGES[name][1]:
+        raise ValueError(f"{name}={value!r}: it must be from {RANGES[name][0]} to {RANGES[name][1]}.")
