@@ -25,7 +25,7 @@ from sb3_momba.baselines.solutions import SolutionSet, as_set, evaluate_policy
 from sb3_momba.baselines.utilities import UtilityOfReturns, generate_utilities, linear_utilities
 from sb3_momba.envs.registry import raw_id
 from sb3_momba.envs.wrappers import make_env
-from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front, probe_environment
+from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.floors import RandomPolicy
 from sb3_momba.settings import check_whole
 
@@ -183,10 +183,8 @@ class Baseline:
         """What range returns have, before any policy is trained."""
         env, n_episodes = self.settings.env, self.hyperparameters["random_episodes"]
         policy = RandomPolicy(probe_environment(env).action_space, self.settings.seed)
-        anything = np.full((1, self.n_objectives), 1 / self.n_objectives)
-        played = evaluate_front(
-            policy, env, preferences=anything, n_episodes=n_episodes, seed=self.settings.seed, deterministic=False
-        )
+        seed = self.settings.seed
+        played = evaluate_policy(policy, env, self.n_objectives, n_episodes, seed=seed, deterministic=False)
         self.extra_steps = int(played.episode_lengths.sum())
         self.low = np.minimum(0, played.returns.min(axis=(0, 1)))
         self.high = np.maximum(0, played.returns.max(axis=(0, 1)))

@@ -2,9 +2,12 @@
 morl-baselines.
 
 A population of PPO policies, one for each weight. After a warm-up each generation chooses which policies to train under which
-weights, by a model that predicts what that would gain. The library judges policies by stochastic episodes with normalised,
-clipped and discounted rewards: their steps are `extra_steps`, and none of its numbers is recorded. What is recorded is the set
-of the policies in its archive and of those that it trains, each played with the observation statistics it was trained with.
+weights, by a model that predicts what that would gain. What is recorded is the set of the policies in its archive and of those
+that it trains, each played with the observation statistics it was trained with.
+
+The library's examples judge policies by stochastic episodes with normalised, clipped and discounted rewards, in an environment
+whose statistics begin anew: its first rewards are large, so that untrained policies stay in the archive. Here, as in the
+authors' code, raw returns of mean actions count, unless `library_evaluation` is set; the steps of both are `extra_steps`.
 """
 
 from collections.abc import Callable
@@ -24,10 +27,15 @@ from sb3_momba.pareto.evaluation import ParetoFront
 
 # They change nothing in the library.
 WITHOUT_EFFECT = ("num_weight_candidates", "min_weight", "max_weight")
-DELTA_WEIGHTS = {2: 0.2, 3: 0.25}  # of the paper: 6 policies for two objectives, 15 for three
-WARMUP, GENERATION = 80, 20  # iterations, of the paper and the library
-SHORTEST = 240  # iterations of the paper's shortest training, Swimmer's: the warm-up and eight generations
+# Of the authors' scripts: 6 policies for two objectives, 15 for three; the library's defaults are those for two.
+BY_OBJECTIVES = {
+    2: {"delta_weight": 0.2},
+    3: {"delta_weight": 0.25, "num_performance_buffer": 20},
+}
+WARMUP, GENERATION = 4, 20  # of the warm-up, in generations; of a generation, in iterations, at most
+LENGTH = 24  # of a training, in generations, before these grow longer: of the authors' shortest one
 LEAST_POLICIES = 4
+JUDGED_BY, JUDGED_FROM = 5, 1_000_000  # episodes, and the seed of the first: others than those of the record
 CLIP, EPSILON = 10.0, 1e-8  # of the library's normalised observations
 
 
@@ -65,8 +73,8 @@ class NormalizedPolicy:
 def schedule(steps: int, per_iteration: int, warmup: int | None, generation: int | None) -> tuple[int, int]:
     """How many iterations the warm-up and each generation have, so that both fill a training.
 
-    From the length of the paper's shortest training on they have 80 and 20, as there; shorter ones keep its shape: a third of
-    warm-up, and at most eight generations. What is no whole generation belongs to the warm-up.
+    A generation is a 24th of the training, and at most 20 iterations; the warm-up is four generations, and what is left over by
+    whole ones. So it is in the authors' scripts for Swimmer (40 and 10 of 244) and HalfCheetah (80 and 20 of 610).
 
     :param per_iteration: steps of one iteration: of an environment, times environments, times policies
     :param warmup: if it is given
@@ -81,9 +89,9 @@ def schedule(steps: int, per_iteration: int, warmup: int | None, generation: int
             f"pop_size): give {near}."
         )
     if generation is None:
-        generation = max(1, min(GENERATION, -(-n * GENERATION // SHORTEST)))
+        generation = max(1, min(GENERATION, round(n / LENGTH)))
     if warmup is None:
-        usual = WARMUP // GENERATION * generation
+        usual = WARMUP * generation
         warmup = usual + (n - usual) % generation
     if n < warmup + generation or (n - warmup) % generation:
         possible = warmup + max(1, (n - warmup) // generation) * generation
@@ -105,7 +113,7 @@ class Baseline:
 
     def __init__(self, settings: BaselineSettings, n_objectives: int):
         library = imported("multi_policy.pgmorl.pgmorl")
-        if n_objectives not in DELTA_WEIGHTS:
+        if n_objectives not in BY_OBJECTIVES:
             raise ValueError(f"{settings.env} has {n_objectives} objectives: PGMORL takes two or three.")
         self.settings, self.n_objectives = settings, n_objectives
         self.hyperparameters = self._complete(library)
@@ -121,25 +129,33 @@ class Baseline:
                 if self.global_step < outer.settings.steps:  # At the end the archive comes first.
                     outer.between_steps()
 
-            def _PGMORL__eval_all_agents(self, *args: Any, **kwargs: Any) -> None:  # noqa: N802
-                super()._PGMORL__eval_all_agents(*args, **kwargs)
-                new, old = outer.statistics, outer.archived
-                outer.archived = {
-                    id(policy): old.get(id(policy)) or Archived(policy, new) for policy in self.archive.individuals
-                }
+            def _PGMORL__eval_all_agents(  # noqa: N802
+                self,
+                eval_env: Any,
+                evaluations_before_train: list[np.ndarray],
+                ref_point: np.ndarray,
+                known_pareto_front: Any = None,
+                add_to_prediction: bool = True,
+            ) -> None:
+                if outer.library_evaluation:
+                    super()._PGMORL__eval_all_agents(
+                        eval_env, evaluations_before_train, ref_point, known_pareto_front, add_to_prediction
+                    )
+                else:
+                    outer.judge(evaluations_before_train, add_to_prediction)
+                outer.note_archive()
 
         self.archived: dict[int, Archived] = {}
+        self.judged_steps = 0
+        own = {name: value for name, value in self.hyperparameters.items() if name != "library_evaluation"}
         env_id = raw_id(settings.env)
         make_one = imported("single_policy.ser.mo_ppo").make_env
         device = "auto" if settings.device == "auto" else th.device(settings.device)
         with quiet_and_seeded(settings.seed):
             try:
-                self.agent = Watched(
-                    env_id, np.zeros(n_objectives), log=False, seed=settings.seed, device=device, **self.hyperparameters
-                )
+                self.agent = Watched(env_id, np.zeros(n_objectives), log=False, seed=settings.seed, device=device, **own)
             except TypeError as error:
                 raise ValueError(f"{settings.env} cannot be made in the way that PGMORL needs it: {error}.") from error
-            # As in the library's own examples: the environment that its policies are judged in normalises too.
             self.eval_env = CountedSteps(make_one(env_id, settings.seed, 1, "evaluation", self.agent.gamma)())
         networks = self.agent.networks[0]
         self.parameters = {
@@ -150,7 +166,7 @@ class Baseline:
     def _complete(self, library: Any) -> dict[str, Any]:
         given = self.settings.hyperparameters
         known = hyperparameters_of(library.PGMORL, WITHOUT_EFFECT)
-        known["delta_weight"] = DELTA_WEIGHTS[self.n_objectives]
+        known.update({**BY_OBJECTIVES[self.n_objectives], "library_evaluation": False})
         complete = completed("pgmorl", given, known)
         if not 0 < complete["delta_weight"] <= 1:
             raise ValueError(f"delta_weight={complete['delta_weight']}: give the distance of weights, between 0 and 1.")
@@ -188,7 +204,12 @@ class Baseline:
     @property
     def extra_steps(self) -> int:
         """Of the episodes that policies were judged by, so far."""
-        return self.eval_env.n_steps
+        return self.eval_env.n_steps + self.judged_steps
+
+    @property
+    def library_evaluation(self) -> bool:
+        """Whether the library judges its policies itself."""
+        return bool(self.hyperparameters["library_evaluation"])
 
     @property
     def statistics(self) -> Statistics:
@@ -208,8 +229,29 @@ class Baseline:
         """:param between_steps: called after each iteration"""
         self.between_steps = between_steps
         with quiet_and_seeded(self.settings.seed):
-            # What its evaluations are compared with is 0 in normalised rewards too.
             self.agent.train(self.settings.steps, self.eval_env, ref_point=np.zeros(self.n_objectives))
+
+    def judge(self, evaluations_before_train: list[np.ndarray], add_to_prediction: bool) -> None:
+        """Tell population, archive and predictions what each policy that is trained earns, in raw returns.
+
+        :param evaluations_before_train: (n_objectives,) for each; overwritten by the new ones
+        :param add_to_prediction: whether the training between the two is one to learn from
+        """
+        agent = self.agent
+        for index, policy in enumerate(agent.agents):
+            played = self._evaluate(Archived(policy, self.statistics), JUDGED_BY, JUDGED_FROM)
+            self.judged_steps += int(played.episode_lengths.sum())
+            value = played.values[0]
+            agent.population.add(policy, value)
+            agent.archive.add(policy, value)
+            if add_to_prediction:
+                agent.predictor.add(policy.weights.detach().cpu().numpy(), evaluations_before_train[index], value)
+            evaluations_before_train[index] = value
+
+    def note_archive(self) -> None:
+        """The archive's policies, copies of those that were trained, with the statistics that they were archived with."""
+        new, old = self.statistics, self.archived
+        self.archived = {id(policy): old.get(id(policy)) or Archived(policy, new) for policy in self.agent.archive.individuals}
 
     def evaluate(self, preferences: np.ndarray) -> SolutionSet:
         """Every policy in the archive, and every one that is trained.
@@ -223,11 +265,13 @@ class Baseline:
 
     def _play(self, one: "Archived") -> ParetoFront:
         if one.played is None:
-            agent = self.agent
-            network = one.policy.networks.actor_mean
-            policy = NormalizedPolicy(network, one.statistics, self.n_objectives, agent.action_space, agent.device)
-            one.played = evaluate_policy(policy, self.settings.env, self.n_objectives, self.settings.n_episodes, agent.gamma)
+            one.played = self._evaluate(one, self.settings.n_episodes, 0)
         return one.played
+
+    def _evaluate(self, one: "Archived", n_episodes: int, seed: int) -> ParetoFront:
+        agent, network = self.agent, one.policy.networks.actor_mean
+        policy = NormalizedPolicy(network, one.statistics, self.n_objectives, agent.action_space, agent.device)
+        return evaluate_policy(policy, self.settings.env, self.n_objectives, n_episodes, agent.gamma, seed)
 
     def close(self) -> None:
         """Close the environments."""

@@ -35,14 +35,23 @@ class SolutionSet:
 
 
 def evaluate_policy(
-    policy: Predictor, env: str | Callable[[], gym.Env], n_objectives: int, n_episodes: int, gamma: float
+    policy: Predictor,
+    env: str | Callable[[], gym.Env],
+    n_objectives: int,
+    n_episodes: int,
+    gamma: float | None = None,
+    seed: int = 0,
+    deterministic: bool = True,
 ) -> ParetoFront:
-    """Play one policy, as `evaluate_front` plays one under one preference; episode e starts from the seed e.
+    """Play one policy, as `evaluate_front` plays one under one preference.
 
     :param policy: its `predict` gets observations of the environment with n_objectives entries behind them that say nothing
+    :param seed: of the first episode
     """
     anything = np.full((1, n_objectives), 1 / n_objectives)
-    return evaluate_front(policy, env, preferences=anything, n_episodes=n_episodes, gamma=gamma)
+    return evaluate_front(
+        policy, env, preferences=anything, n_episodes=n_episodes, gamma=gamma, seed=seed, deterministic=deterministic
+    )
 
 
 def as_set(played: Sequence[ParetoFront], **known: Any) -> SolutionSet:
