@@ -423,8 +423,8 @@ def test_a_schedule_fills_every_number_of_iterations() -> None:
 @pytest.mark.parametrize(
     ("steps", "given", "message"),
     [
-        (100_000, (None, None), r"49,152 steps.*give 98,304 \(2\) or 147,456 \(3\)"),
-        (10_000, (None, None), r"give 49,152 \(1\)\.$"),
+        (1_000_000, (None, None), r"49,152 steps.*give 983,040 \(20\) or 1,032,192 \(21\)\.$"),
+        (100_000, (None, None), r"give 245,760 \(5\)\.$"),
         (98_304, (None, None), r"2 iterations of 49,152: behind a warm-up of 4 .* generations of 1.* Give 245,760 \(5\)"),
         (491_520, (80, 20), r"10 iterations .* warm-up of 80 .* Give 4,915,200 \(100\)"),
         (5_013_504, (80, 20), r"102 iterations .* Give 4,915,200 \(100\)"),

@@ -83,7 +83,8 @@ def schedule(steps: int, per_iteration: int, warmup: int | None, generation: int
     """
     n = steps // per_iteration
     if steps % per_iteration:
-        near = " or ".join(f"{k * per_iteration:,} ({k})" for k in (n, n + 1) if k)
+        least = (warmup or WARMUP) + (generation or 1)
+        near = " or ".join(f"{k * per_iteration:,} ({k})" for k in sorted({max(n, least), max(n + 1, least)}))
         raise ValueError(
             f"steps={steps:,} is no whole number of iterations of {per_iteration:,} steps (steps_per_iteration x num_envs x "
             f"pop_size): give {near}."
