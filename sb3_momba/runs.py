@@ -158,10 +158,10 @@ def preferences_of(settings: RunSettings, n_objectives: int) -> np.ndarray:
     return check_preference(np.array([settings.preference]), n_objectives).astype(np.float64)
 
 
-def run(settings: RunSettings, callback: BaseCallback | None = None) -> RunResult:
+def run(settings: RunSettings, on_step: Callable[[int], None] | None = None) -> RunResult:
     """Train, evaluate and write the run's folder.
 
-    :param callback: a further one, which changes no result
+    :param on_step: called after each step of the environments with the number of steps so far; it changes no result
     """
     folder = Path(settings.output)
     check_empty(folder)
@@ -177,7 +177,13 @@ def run(settings: RunSettings, callback: BaseCallback | None = None) -> RunResul
         with ready.record.start(**description(settings, config, ready.preferences, ready.reference_point, sizes)) as record:
             append_floors(record, evaluation.eval_env, ready.preferences, ready.reference_point, settings.n_episodes)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
-            return _train(settings, ready, record, settings.steps, callback)
+            return _train(settings, ready, record, settings.steps, on_step)
+
+
+def check(settings: RunSettings) -> None:
+    """:raises ValueError: for settings that cannot be"""
+    with prepared(settings):
+        pass
 
 
 def check_empty(folder: Path) -> None:
@@ -186,10 +192,10 @@ def check_empty(folder: Path) -> None:
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
 
 
-def resume(folder: Path, callback: BaseCallback | None = None, **running: Any) -> RunResult:
+def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running: Any) -> RunResult:
     """Go on with a run that was cut off, from its newest checkpoint.
 
-    :param callback: a further one, which changes no result
+    :param on_step: see `run`
     :param running: settings that no result depends on, such as eval_workers
     :raises ValueError: if there is nothing to go on with
     """
@@ -209,16 +215,28 @@ def resume(folder: Path, callback: BaseCallback | None = None, **running: Any) -
     ):
         name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
         ready.model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]))
-        return _train(settings, ready, record, ready.model.remaining_timesteps, callback)
+        return _train(settings, ready, record, ready.model.remaining_timesteps, on_step)
+
+
+class StepCallback(BaseCallback):
+    """Tells someone how many steps there were."""
+
+    def __init__(self, on_step: Callable[[int], None]):
+        super().__init__()
+        self.on_step_of_run = on_step
+
+    def _on_step(self) -> bool:
+        self.on_step_of_run(self.num_timesteps)
+        return True
 
 
 def _train(
-    settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int, callback: BaseCallback | None
+    settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int, on_step: Callable[[int], None] | None
 ) -> RunResult:
     folder, model, evaluation = Path(settings.output), ready.model, ready.evaluation
     checkpoints = MombaCheckpointCallback(settings.checkpoint_freq, folder / CHECKPOINTS, settings.keep_checkpoints)
     try:
-        callbacks = CallbackList([evaluation, checkpoints, *([] if callback is None else [callback])])
+        callbacks = CallbackList([evaluation, checkpoints, *([] if on_step is None else [StepCallback(on_step)])])
         model.learn(steps, callbacks, reset_num_timesteps=model.num_timesteps == 0, progress_bar=settings.progress_bar)
     finally:
         model.save(folder / "model.zip")

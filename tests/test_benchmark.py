@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -1286,11 +1287,11 @@ def test_what_has_to_run(tmp_path) -> None:
     (tmp_path / "torn").mkdir()
     (tmp_path / "torn" / "record.jsonl").write_bytes((tmp_path / "finished" / "record.jsonl").read_bytes()[:100])
     expected = {"finished": False, "failed": False, "cut off": True, "empty": True, "torn": True, "missing": True}
-    assert {name: has_to_run(tmp_path / name, settings) for name in expected} == expected
+    assert {name: has_to_run(cell, replace(settings, output=str(tmp_path / name))) for name in expected} == expected
     other = train.parse([*cell.arguments(tmp_path), "--n-episodes", "2"])
     for name in ended:
         with pytest.raises(ValueError, match=r"other settings \(n_episodes\)"):
-            has_to_run(tmp_path / name, other)
+            has_to_run(cell, replace(other, output=str(tmp_path / name)))
 
 
 def test_logs_lie_beside_the_folders(training, tmp_path) -> None:

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from sb3_momba import train
+from sb3_momba.baselines.settings import VARIANTS
 from sb3_momba.benchmark import cells
 from sb3_momba.benchmark.cells import Cell, as_arguments, cells_of, make_cells, merged, read_grid, shipped_grids
 from sb3_momba.envs.pgmorl import TASKS
@@ -129,6 +130,19 @@ def test_no_cells_are_no_cells() -> None:
     assert merged([]) == []
 
 
+def test_baselines_are_variants_like_others(tmp_path) -> None:
+    grid = written(tmp_path, variants=["momba", "gpi_ls_utd_1"], tasks=["MO-Hopper-v4"], seeds=1, auto_ent_coef=0.01)
+    ours, theirs = asked_for("--steps", "1e4", grid=[grid])
+    assert theirs.name == "gpi_ls_utd_1/MO-Hopper-v4/0"
+    settings = cells.checked([ours, theirs], tmp_path)[theirs.name]
+    assert (settings.algorithm, settings.label, settings.steps) == ("gpi_ls", "gpi_ls_utd_1", 10_000)
+    assert settings.hyperparameters == {"gradient_updates": 1}
+    assert cells.has_to_run(theirs, settings)
+    theirs.program.runs.record_failure(settings, "it did not start")
+    assert not cells.has_to_run(theirs, settings)
+    assert list(cells.failed([theirs], tmp_path)) == [theirs.name]
+
+
 # ------------------------------------------------------------------------------------------------------- shipped grids
 
 
@@ -137,15 +151,15 @@ def test_shipped_grids_are_of_the_seven_tasks(name: str) -> None:
     grid = read_grid(name)
     assert sorted(grid.tasks) == sorted(TASKS)
     assert len(set(grid.variants)) == len(grid.variants)
-    for conf in grid.variants:
-        read_configuration(conf, grid.tasks[0])
+    for cell in make_cells(grid.variants, grid.tasks[:1], 1, as_arguments(grid.options)):
+        assert cell.program.parse(cell.arguments(Path("x"))).label == cell.conf
 
 
 def test_no_two_variants_of_the_shipped_grids_are_one_method() -> None:
     """What would be trained twice is Momba's under its own name."""
     seen: dict[str, str] = {}
     for name in shipped_grids():
-        for conf in read_grid(name).variants:
+        for conf in set(read_grid(name).variants) - set(VARIANTS):
             found = read_configuration(conf, "MO-Hopper-v4")
             what = repr((found.policy, sorted(with_defaults(found.policy, found.hyperparameters).items(), key=str)))
             assert seen.setdefault(what, conf) == conf

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -20,7 +19,7 @@ import psutil
 import pytest
 from ray.cluster_utils import Cluster
 
-from sb3_momba import train
+from sb3_momba import runs, train
 from sb3_momba.benchmark import trials
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.cells import make_cells
@@ -174,10 +173,10 @@ def trial(tmp_path, monkeypatch) -> Callable[[], list[dict[str, Any]]]:
     monkeypatch.setattr(trials.tune, "report", reports.append)
     monkeypatch.setattr(trials, "SECONDS_FOR_A_LOCK", 0.1)
     (cell,) = make_cells(["momba"], [ENV], 1, TINY.format(steps=300).split())
-    settings = asdict(train.parse(cell.arguments(tmp_path / "sweep" / cell.name)))
+    settings = train.parse(cell.arguments(tmp_path / "sweep" / cell.name))
 
     def run() -> list[dict[str, Any]]:
-        trials.train_cell({"cell": {"name": cell.name, "output": str(tmp_path / "sweep"), "settings": settings}})
+        trials.train_cell({"trial": {"cell": cell, "output": str(tmp_path / "sweep"), "settings": settings}})
         return reports
 
     return run
@@ -209,7 +208,7 @@ def test_a_full_disk_ends_a_trial_and_the_next_sweep_begins_it_again(tmp_path, t
 
     with alone_in(tmp_path / "sweep"):
         with monkeypatch.context() as patch:
-            patch.setattr(trials, "run", full)
+            patch.setattr(runs, "run", full)
             assert "No space left on device" in trial()[-1]["error"]
         assert not ended(tmp_path / "sweep" / RUNS[0])
         trial()
@@ -243,7 +242,7 @@ def test_what_no_node_can_run_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(trials.ray, "nodes", lambda: nodes)
     for threads, gpus in ((8, 0.0), (1, 0.5)):
         with pytest.raises(ValueError, match=f"threads={threads}, gpus={gpus}: no node has as many"):
-            trials.run_trials({"a": {}}, tmp_path, None, threads, gpus, 0)
+            trials.run_trials([], {}, tmp_path, None, threads, gpus, 0)
 
 
 def test_two_sweeps_on_one_folder_are_refused(tmp_path) -> None:

@@ -4,21 +4,20 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import gymnasium as gym
 
 from sb3_momba.baselines.runs import BaselineResult, run
-from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
+from sb3_momba.baselines.settings import STEPS, VARIANTS, BaselineSettings
 from sb3_momba.pareto import protocol
 from sb3_momba.train import assign, metrics_table, whole_number
 
 
 def parse(arguments: Sequence[str] | None = None) -> BaselineSettings:
     parser = argparse.ArgumentParser(prog="python -m sb3_momba.baselines", description=__doc__, allow_abbrev=False)
-    parser.add_argument("algorithm", choices=ALGORITHMS)
+    parser.add_argument("algorithm", choices=VARIANTS)
     parser.add_argument("--env", required=True, help="environment id")
-    parser.add_argument("--steps", type=whole_number, required=True, help="environment steps of all policies together")
+    parser.add_argument("--steps", type=whole_number, help="environment steps of all policies together; Table 4.2's by default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--label", help="the method's name in reports; by default the algorithm's")
     parser.add_argument("--output", help="folder of the run; by default runs/ENV/ALGORITHM-TIME-SEED")
@@ -31,16 +30,17 @@ def parse(arguments: Sequence[str] | None = None) -> BaselineSettings:
     parser.add_argument("--n-episodes", type=int, default=protocol.N_EPISODES, help="per policy and preference")
     parser.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0")
     given = parser.parse_args(arguments)
-    hyperparameters: dict[str, Any] = {}
+    algorithm, not_default = VARIANTS[given.algorithm]
+    hyperparameters = dict(not_default)
     for assignment in given.set:
         assign(hyperparameters, assignment)
     return BaselineSettings(
-        algorithm=given.algorithm,
+        algorithm=algorithm,
         env=given.env,
         output=given.output or f"runs/{given.env}/{given.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
-        steps=given.steps,
+        steps=STEPS[algorithm] if given.steps is None else given.steps,
         seed=given.seed,
-        label=given.label or "",
+        label=given.label or given.algorithm,
         hyperparameters=hyperparameters,
         eval_freq=given.eval_freq,
         n_preferences=given.n_preferences,

@@ -1,14 +1,15 @@
 """Runs of baselines: an algorithm trains, is evaluated under the protocol while it does, and leaves a record in its folder."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings, recorded_settings
+from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
 from sb3_momba.baselines.solutions import SolutionSet
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.files import alone_in
@@ -16,7 +17,7 @@ from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import CLOCKS
 from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.metrics import hypervolume, summarise
-from sb3_momba.records import FILE_NAME, RecordWriter
+from sb3_momba.records import FILE_NAME, RecordWriter, plain
 from sb3_momba.runs import append_floors, check_empty, description
 from sb3_momba.settings import check_whole, nearest
 
@@ -118,31 +119,37 @@ class Curve:
         )
 
 
-def run(settings: BaselineSettings) -> BaselineResult:
-    """Train, evaluate and write the run's record.
+@dataclass
+class Prepared:
+    """A run that nothing speaks against."""
 
-    :raises ValueError: for settings that cannot be, before anything is written
+    baseline: Baseline
+    preferences: np.ndarray
+    reference_point: Sequence[float]
+
+
+@contextlib.contextmanager
+def prepared(settings: BaselineSettings) -> Iterator[Prepared]:
+    """The algorithm, ready to train. Nothing is written.
+
+    :raises ValueError: for settings that cannot be
     :raises ImportError: if the extra of a baseline is not installed
     """
     if settings.algorithm not in ALGORITHMS:
         raise ValueError(f"There is no baseline {settings.algorithm!r}{nearest(settings.algorithm, ALGORITHMS)}")
     for name, least in {"steps": 1, "seed": 0, "eval_freq": 1, "n_preferences": 1, "n_episodes": 1}.items():
         check_whole(name, getattr(settings, name), least)
-    folder = Path(settings.output)
-    check_empty(folder)
     n_objectives = probe_environment(settings.env).n_objectives
     if n_objectives < 2:
         raise ValueError(f"{settings.env} has one objective: a baseline needs at least two.")
     preferences = preference_grid(n_objectives, settings.n_preferences)
     reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives)
     hypervolume(np.zeros((1, n_objectives)), reference_point)  # It refuses what is no such point.
-    made = make_baseline(settings, n_objectives)
+    baseline = make_baseline(settings, n_objectives)
     try:
-        with alone_in(folder):
-            check_empty(folder)  # Another run may have come first.
-            return _train(made, settings, preferences, reference_point)
+        yield Prepared(baseline, preferences, reference_point)
     finally:
-        made.close()
+        baseline.close()
 
 
 def make_baseline(settings: BaselineSettings, n_objectives: int) -> Baseline:
@@ -155,16 +162,59 @@ def make_baseline(settings: BaselineSettings, n_objectives: int) -> Baseline:
     return module.Baseline(settings, n_objectives)
 
 
-def _train(
-    baseline: Baseline, settings: BaselineSettings, preferences: np.ndarray, reference_point: Sequence[float]
-) -> BaselineResult:
+def run(settings: BaselineSettings, on_step: Callable[[int], None] | None = None) -> BaselineResult:
+    """Train, evaluate and write the run's record.
+
+    :param on_step: called now and then with the number of steps so far; it changes no result
+    :raises ValueError: for settings that cannot be, before anything is written
+    :raises ImportError: if the extra of a baseline is not installed
+    """
     folder = Path(settings.output)
-    is_general = baseline.general_policy
-    config = recorded_settings(settings, baseline.hyperparameters)
-    start = description(settings, config, preferences, reference_point, baseline.parameters, is_general)
-    with RecordWriter(folder / FILE_NAME).start(**start) as record:
-        floors = append_floors(record, settings.env, preferences, reference_point, settings.n_episodes, is_general)
-        curve = Curve(baseline, record, settings.eval_freq, preferences, reference_point)
-        baseline.train(curve.between_steps)
-        curve.finish()
-    return BaselineResult(curve.timesteps, curve.metrics, floors, folder)
+    check_empty(folder)
+    with prepared(settings) as ready, alone_in(folder):
+        check_empty(folder)  # Another run may have come first.
+        baseline = ready.baseline
+        with RecordWriter(folder / FILE_NAME).start(**_start(settings, ready)) as record:
+            rules = (ready.preferences, ready.reference_point)
+            floors = append_floors(record, settings.env, *rules, settings.n_episodes, baseline.general_policy)
+            curve = Curve(baseline, record, settings.eval_freq, *rules)
+
+            def between_steps() -> None:
+                curve.between_steps()
+                if on_step is not None:
+                    on_step(baseline.steps)
+
+            baseline.train(between_steps)
+            curve.finish()
+        return BaselineResult(curve.timesteps, curve.metrics, floors, folder)
+
+
+def check(settings: BaselineSettings) -> None:
+    """:raises ValueError: for settings that cannot be"""
+    with prepared(settings):
+        pass
+
+
+def record_failure(settings: BaselineSettings, error: str) -> None:
+    """A record in the run's folder of a run that died before it could begin one."""
+    with prepared(settings) as ready:
+        start = _start(settings, ready)
+    with contextlib.suppress(RuntimeError), RecordWriter(Path(settings.output) / FILE_NAME).start(**start):
+        raise RuntimeError(error)
+
+
+def recorded_settings(settings: BaselineSettings) -> dict[str, Any]:
+    """Every setting that a result depends on, defaults included, as JSON holds it."""
+    with prepared(settings) as ready:
+        return _config(settings, ready.baseline)
+
+
+def _config(settings: BaselineSettings, baseline: Baseline) -> dict[str, Any]:
+    config = {name: value for name, value in asdict(settings).items() if name != "output"}  # No result depends on it.
+    return dict(plain({**config, "hyperparameters": baseline.hyperparameters}))
+
+
+def _start(settings: BaselineSettings, ready: Prepared) -> dict[str, Any]:
+    baseline, config = ready.baseline, _config(settings, ready.baseline)
+    about = (ready.preferences, ready.reference_point, baseline.parameters, baseline.general_policy)
+    return description(settings, config, *about)

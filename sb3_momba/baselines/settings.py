@@ -1,16 +1,21 @@
 """What a run of a baseline is set to, and whether that can be."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_momba.pareto import protocol
-from sb3_momba.records import plain
 from sb3_momba.settings import RANGES, check_switch, check_whole, is_number
 
 ALGORITHMS = ("pgmorl", "gpi_ls", "dpmorl")
+# Rows of chapter 4: the algorithm, and what is not its default. UTD 1 is in figure 4.4.
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    **{name: (name, {}) for name in ALGORITHMS},
+    "gpi_ls_utd_1": ("gpi_ls", {"gradient_updates": 1}),
+}
+# Table 4.2. PGMORL's 12M to 120M are for several tasks; this is the multiple of its schedule's unit above the lower one.
+STEPS = {"pgmorl": 12_042_240, "gpi_ls": 200_000, "dpmorl": 10_000_000}
 LEAST = {"learning_starts": 0, "batch_size": 2}  # of whole numbers; 1 of others
-NOT_RECORDED = ("output",)  # No result depends on it.
 
 
 @dataclass
@@ -45,15 +50,6 @@ class BaselineSettings:
 
     def __post_init__(self) -> None:
         self.label = self.label or self.algorithm
-
-
-def recorded_settings(settings: BaselineSettings, hyperparameters: dict[str, Any]) -> dict[str, Any]:
-    """Every setting that a result depends on, as JSON holds it.
-
-    :param hyperparameters: all of them, defaults included
-    """
-    config = {name: value for name, value in asdict(settings).items() if name not in NOT_RECORDED}
-    return dict(plain({**config, "hyperparameters": hyperparameters}))
 
 
 def completed(algorithm: str, given: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 A grid is a yaml file:
 
-    variants: [momba, capql]         # shipped configurations, or yaml files
+    variants: [momba, capql, gpi_ls] # shipped configurations, yaml files, or baselines
     tasks: [MO-Hopper-v4]            # environment ids
     seeds: 10                        # they are 0 to 9
     options: {eval_freq: 20_000}     # of `python -m sb3_momba.train`; none by default
@@ -14,7 +14,7 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
@@ -23,26 +23,47 @@ from typing import Any
 
 import yaml
 
+from sb3_momba import runs, train
+from sb3_momba.baselines import __main__ as baselines
+from sb3_momba.baselines import runs as baseline_runs
+from sb3_momba.baselines.settings import VARIANTS
 from sb3_momba.benchmark.results import FIXED_PREFERENCE, flat
 from sb3_momba.checkpoints.folders import newest
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.files import LOCK, FileFormatError
 from sb3_momba.pareto.evaluation import probe_environment
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
-from sb3_momba.runs import CHECKPOINTS, RunSettings, prepared, recorded_settings
+from sb3_momba.runs import CHECKPOINTS
 from sb3_momba.settings import check_names, nearest, parse_ent_coef
-from sb3_momba.train import parse
 from sb3_momba.zoo.configuration import literal, read_configuration, with_later_settings
 
 SHIPPED = resources.files("sb3_momba.benchmark") / "grids"
 
 
 @dataclass(frozen=True)
+class Program:
+    """What trains a cell.
+
+    :param module: of its command line, `python -m module`
+    :param parse: what reads that
+    :param runs: module with `check`, `run`, `recorded_settings` and `record_failure` of the settings
+    """
+
+    module: str
+    parse: Callable[[Sequence[str]], Any]
+    runs: Any
+
+
+MOMBA = Program("sb3_momba.train", train.parse, runs)
+BASELINES = Program("sb3_momba.baselines", baselines.parse, baseline_runs)
+
+
+@dataclass(frozen=True)
 class Cell:
     """One run.
 
-    :param conf: yaml file or name of a shipped configuration
-    :param options: further ones of `python -m sb3_momba.train`
+    :param conf: yaml file or name of a shipped configuration, or a baseline's name
+    :param options: further ones of `python -m sb3_momba.train` or `python -m sb3_momba.baselines`
     :param method: first part of the cell's name; by default the configuration's
     """
 
@@ -56,10 +77,16 @@ class Cell:
     def name(self) -> str:
         return f"{self.method or Path(self.conf).stem}/{self.env}/{self.seed}"
 
+    @property
+    def program(self) -> Program:
+        return BASELINES if self.conf in VARIANTS else MOMBA
+
     def arguments(self, folder: Path) -> list[str]:
-        """Of `python -m sb3_momba.train`."""
-        where = ["--conf", self.conf, "--env", self.env, "--seed", str(self.seed), "--output", str(folder)]
-        return [*self.options, *where, "--no-progress-bar"]
+        """Of its program."""
+        where = ["--env", self.env, "--seed", str(self.seed), "--output", str(folder)]
+        if self.program is BASELINES:
+            return [self.conf, *self.options, *where]
+        return [*self.options, "--conf", self.conf, *where, "--no-progress-bar"]
 
 
 @dataclass(frozen=True)
@@ -140,11 +167,19 @@ def make_cells(
     for seed in range(seeds):
         for env in dict.fromkeys(envs):
             for conf in dict.fromkeys(confs):
-                learned, _ = parse_ent_coef(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto"))
+                learned = learns_alpha(conf, env)
                 start = ("--ent-coef", f"auto_{auto_ent_coef}") if auto_ent_coef is not None and learned else ()
                 cell = Cell(conf, env, seed, (*start, *options))
                 cells += _with_fixed_preferences(cell, fixed_preferences) if fixed_preferences else [cell]
     return merged(cells)
+
+
+def learns_alpha(conf: str, env: str) -> bool:
+    """:raises ValueError: for a configuration that does not exist"""
+    if conf in VARIANTS:
+        return False
+    learned, _ = parse_ent_coef(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto"))
+    return learned
 
 
 def _with_fixed_preferences(cell: Cell, numbers: Mapping[int, int]) -> list[Cell]:
@@ -181,31 +216,31 @@ def merged(cells: Iterable[Cell]) -> list[Cell]:
     return list(by_name.values())
 
 
-def checked(cells: Sequence[Cell], output: Path) -> dict[str, RunSettings]:
-    """The settings of each cell, by its name.
+def checked(cells: Sequence[Cell], output: Path) -> dict[str, Any]:
+    """What the program of each cell reads from its arguments, by the cell's name.
 
     :raises ValueError: for settings that cannot be
     :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
-    settings = {cell.name: parse(cell.arguments(output / cell.name)) for cell in cells}
-    for one in {(cell.conf, cell.env, cell.method): settings[cell.name] for cell in cells}.values():
-        with prepared(one):
-            pass
+    settings = {cell.name: cell.program.parse(cell.arguments(output / cell.name)) for cell in cells}
+    for cell in {(cell.conf, cell.env, cell.method): cell for cell in cells}.values():
+        cell.program.runs.check(settings[cell.name])
     return settings
 
 
-def has_to_run(folder: Path, settings: RunSettings, retry_failed: bool = False) -> bool:
+def has_to_run(cell: Cell, settings: Any, retry_failed: bool = False) -> bool:
     """Whether a cell never ran or was cut off.
 
     :raises ValueError: if its folder holds anything but a run with these settings
     """
+    folder = Path(settings.output)
     record = folder / FILE_NAME
     if not record.exists() or is_cut_off_at_its_start(record):
         if folder.exists() and (not folder.is_dir() or any(file.name not in (FILE_NAME, LOCK) for file in folder.iterdir())):
             raise ValueError(f"{folder} holds something else than a run: choose another --output.")
         return True
     found = read_record(record)
-    theirs, ours = flat(with_later_settings(found.config)), flat(recorded_settings(settings))
+    theirs, ours = flat(with_later_settings(found.config)), flat(cell.program.runs.recorded_settings(settings))
     differing = sorted(name for name in {*theirs, *ours} if theirs.get(name) != ours.get(name))
     if differing:
         raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
@@ -241,7 +276,7 @@ def log_of(folder: Path) -> Path:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Those that say what a grid consists of; see `cells_of`."""
     parser.add_argument("--grid", nargs="+", default=[], help=f"yaml files, or shipped: {', '.join(shipped_grids())}")
-    parser.add_argument("--conf", nargs="+", default=[], help="instead: shipped configurations or yaml files")
+    parser.add_argument("--conf", nargs="+", default=[], help="instead: shipped configurations, yaml files or baselines")
     parser.add_argument("--env", nargs="+", default=[], help="environment ids; by default the grid's")
     parser.add_argument("--seeds", type=int, help="how many, 0, 1, ...; by default the grid's")
     parser.add_argument("--output", type=Path, required=True, help="folder of the run folders")
@@ -249,7 +284,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--auto-ent-coef", type=float, help="where every configuration that learns alpha starts it; 0.01 below 200,000 steps"
     )
-    parser.epilog = "Every other option is handed to python -m sb3_momba.train, such as --steps 3e4."
+    parser.epilog = "Every other option is handed to python -m sb3_momba.train (or baselines), such as --steps 3e4."
 
 
 def cells_of(given: argparse.Namespace, options: Sequence[str]) -> list[Cell]:

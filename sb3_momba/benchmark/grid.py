@@ -11,12 +11,12 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from sb3_momba.benchmark import cells
 from sb3_momba.benchmark.cells import Cell
 from sb3_momba.files import alone_in
 from sb3_momba.records import FILE_NAME, is_cut_off_at_its_start, read_record
-from sb3_momba.runs import RunSettings, record_failure
 
 logger = logging.getLogger(__name__)
 
@@ -33,17 +33,17 @@ def run_grid(grid: Sequence[Cell], output: Path, processes: int = 2, retry_faile
         raise ValueError(f"processes={processes}: at least one is needed.")
     settings = cells.checked(grid, output)
     with alone_in(output), ThreadPoolExecutor(processes) as pool:
-        waiting = [cell for cell in grid if cells.has_to_run(output / cell.name, settings[cell.name], retry_failed)]
+        waiting = [cell for cell in grid if cells.has_to_run(cell, settings[cell.name], retry_failed)]
         list(pool.map(lambda cell: _run_cell(cell, settings[cell.name]), waiting))
     return cells.failed(grid, output)
 
 
-def _run_cell(cell: Cell, settings: RunSettings) -> None:
+def _run_cell(cell: Cell, settings: Any) -> None:
     logger.info("%s starts", cell.name)
     folder = Path(settings.output)
     goes_on = cells.goes_on(folder)
     arguments = ["--resume", str(folder), "--no-progress-bar"] if goes_on else cell.arguments(folder)
-    command = [sys.executable, "-m", "sb3_momba.train", *arguments]
+    command = [sys.executable, "-m", cell.program.module, *arguments]
     with open(cells.log_of(folder), "ab" if goes_on else "wb") as log:
         # Runs side by side share the cores: one thread each.
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -51,8 +51,8 @@ def _run_cell(cell: Cell, settings: RunSettings) -> None:
     record = folder / FILE_NAME
     if not record.exists() or is_cut_off_at_its_start(record):
         record.unlink(missing_ok=True)
-        said = cells.log_of(folder).read_text(errors="replace").split("\n")
-        record_failure(settings, f"it did not start: {next((line for line in reversed(said) if line.strip()), 'no output')}")
+        said = [line for line in cells.log_of(folder).read_text(errors="replace").splitlines() if line.strip()]
+        cell.program.runs.record_failure(settings, f"it did not start: {said[-1] if said else 'no output'}")
     error = read_record(record).error
     logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
 

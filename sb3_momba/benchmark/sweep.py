@@ -9,7 +9,6 @@ import argparse
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from sb3_momba.benchmark import cells
@@ -57,12 +56,11 @@ def run_sweep(
     output = output.resolve()
     settings = cells.checked(grid, output)
     with alone_in(output):
-        waiting = [cell.name for cell in grid if cells.has_to_run(output / cell.name, settings[cell.name], retry_failed)]
+        waiting = [cell for cell in grid if cells.has_to_run(cell, settings[cell.name], retry_failed)]
         said = {}
         if waiting:
             with trials.cluster(address, (workers or 1) * threads, threads):
-                asked_for = {name: asdict(settings[name]) for name in waiting}
-                said = trials.run_trials(asked_for, output, workers, threads, gpus, max_failures)
+                said = trials.run_trials(waiting, settings, output, workers, threads, gpus, max_failures)
         failed = cells.failed(grid, output)
     return {name: said.get(name, error) for name, error in failed.items()}
 

@@ -24,11 +24,11 @@ from ray.tune.experiment import Trial
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_momba.benchmark import cells
+from sb3_momba.benchmark.cells import Cell
 from sb3_momba.files import LOCK, FolderInUseError, alone_in
-from sb3_momba.runs import RunSettings, resume, run
+from sb3_momba.runs import resume
 
 STATE = ".tune"  # Ray Tune's own files, in the output folder; nothing is read from them
 OBJECT_STORE_BYTES = 100_000_000  # trials exchange a few numbers
@@ -79,28 +79,30 @@ def _check_answers(address: str) -> None:
 
 
 def run_trials(
-    settings: Mapping[str, dict[str, Any]],
+    grid: Sequence[Cell],
+    settings: Mapping[str, Any],
     output: Path,
     workers: int | None,
     threads: int,
     gpus: float,
     max_failures: int,
 ) -> dict[str, str]:
-    """Run each of these, by name; what those that did not finish have said last.
+    """Run each of these; what those that did not finish have said last, by name.
 
+    :param settings: what the program of each cell has read, by the cell's name
     :raises ValueError: if no node has the processors that a run needs
     """
     resources: dict[str, float] = {"CPU": threads, **({"GPU": gpus} if gpus else {})}
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
     if not any(all(node.get(name, 0) >= amount for name, amount in resources.items()) for node in nodes):
         raise ValueError(f"threads={threads}, gpus={gpus}: no node has as many for one run; choose less, or add one.")
-    trials = [{"name": name, "output": str(output), "settings": one} for name, one in settings.items()]
+    trials = [{"cell": cell, "settings": settings[cell.name], "output": str(output)} for cell in grid]
     watch = Watch(len(trials))
     for name in ("ray.tune", "ray.train"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # Lost processes are told of here.
     tuner = tune.Tuner(
         tune.with_resources(train_cell, resources),
-        param_space={"cell": tune.grid_search(trials)},
+        param_space={"trial": tune.grid_search(trials)},
         tune_config=tune.TuneConfig(max_concurrent_trials=workers, trial_dirname_creator=lambda trial: trial.trial_id),
         run_config=tune.RunConfig(
             name=STATE,
@@ -122,15 +124,12 @@ def run_trials(
 
 def train_cell(config: dict[str, Any]) -> None:
     """One trial. What its training raises ends it; only the death of its process, which raises nothing, lets it begin again."""
-    cell = config["cell"]
-    settings = RunSettings(**{**cell["settings"], "progress_bar": False})
-    folder = Path(settings.output)
+    cell, settings, output = config["trial"]["cell"], config["trial"]["settings"], Path(config["trial"]["output"])
+    folder = output / cell.name
     tune.report({"steps": 0})
     try:
-        if not (Path(cell["output"]) / LOCK).exists():
-            raise FileNotFoundError(
-                f"{socket.gethostname()} does not see {cell['output']}: choose an --output that all nodes share."
-            )
+        if not (output / LOCK).exists():
+            raise FileNotFoundError(f"{socket.gethostname()} does not see {output}: choose an --output that all nodes share.")
         _wait_until_free(folder)
         goes_on = cells.goes_on(folder)
         with (
@@ -141,7 +140,7 @@ def train_cell(config: dict[str, Any]) -> None:
             if goes_on:
                 resume(folder, Progress(), progress_bar=False)
             else:
-                run(settings, Progress())
+                cell.program.runs.run(settings, Progress())
     except Exception:
         tune.report({"error": traceback.format_exc()})
 
@@ -162,17 +161,16 @@ def _wait_until_free(folder: Path) -> None:
             time.sleep(1)
 
 
-class Progress(BaseCallback):
-    """Tells Ray Tune how far a run is."""
+class Progress:
+    """Tells Ray Tune now and then how far a run is."""
 
-    def _on_training_start(self) -> None:
+    def __init__(self) -> None:
         self.next_report = 0.0
 
-    def _on_step(self) -> bool:
+    def __call__(self, steps: int) -> None:
         if time.monotonic() >= self.next_report:
-            tune.report({"steps": self.num_timesteps})
+            tune.report({"steps": steps})
             self.next_report = time.monotonic() + SECONDS_BETWEEN_REPORTS
-        return True
 
 
 class Watch(tune.Callback):
@@ -224,10 +222,10 @@ class Watch(tune.Callback):
             if trial.status == Trial.RUNNING:
                 result = trial.last_result
                 where = (str(result.get("node_ip", "")), str(result.get("pid", "")))
-                steps = trial.config["cell"]["settings"]["steps"]
+                steps = trial.config["trial"]["settings"].steps
                 table.add_row(name_of(trial), *where, f"{result.get('steps', 0):,}", f"{steps:,}", str(trial.num_failures))
         return table
 
 
 def name_of(trial: Trial) -> str:
-    return str(trial.config["cell"]["name"])
+    return str(trial.config["trial"]["cell"].name)
