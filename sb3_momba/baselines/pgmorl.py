@@ -6,8 +6,8 @@ weights, by a model that predicts what that would gain. What is recorded is the 
 that it trains, each played with the observation statistics it was trained with.
 
 The library's examples judge policies by stochastic episodes with normalised, clipped and discounted rewards, in an environment
-whose statistics begin anew: its first rewards are large, so that untrained policies stay in the archive. Here, as in the
-authors' code, raw returns of mean actions count, unless `library_evaluation` is set; the steps of both are `extra_steps`.
+whose statistics begin anew. Here, as in the authors' code, raw returns of mean actions count, unless `library_evaluation` is
+set; the steps of both are `extra_steps`.
 """
 
 from collections.abc import Callable
