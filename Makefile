@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence rounding speed torture compat clean
+.PHONY: demo test browser lint known-fronts first-records evidence reduced rounding speed torture compat clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -43,6 +43,13 @@ evidence: $(VENV)/installed
 	$(BIN)/python -m sb3_momba.benchmark run --conf momba her_par $(EVIDENCE) --auto-ent-coef 0.01 \
 		--set precision=auto --set compile=true --output runs/evidence/momba
 	$(BIN)/python -m sb3_momba.benchmark report runs/evidence
+
+# The ablations of chapter 4 in short, on one task: about twelve hours of one core.
+reduced: $(VENV)/installed
+	$(BIN)/python -m sb3_momba.benchmark run --grid value_representation normalization her_par conditioning utd critic_scaling \
+		--env MO-HalfCheetah-v4 --seeds 2 --steps 3e4 --eval-freq 5e3 --auto-ent-coef 0.01 \
+		--set precision=auto --set compile=true --output runs/reduced
+	$(BIN)/python -m sb3_momba.benchmark chapter4 runs/reduced
 
 rounding: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m tests.rounding

@@ -12,11 +12,10 @@ import logging
 import sys
 from pathlib import Path
 
-from sb3_momba.benchmark.cells import make_cells
-from sb3_momba.benchmark.report import write_report
+from sb3_momba.benchmark.grid import make_cells
+from sb3_momba.benchmark.report import read_begun, write_report
 from sb3_momba.benchmark.results import compare
 from sb3_momba.benchmark.sweep import run_sweep
-from sb3_momba.records import find_records, read_record
 
 
 def main(steps: int = 2_000, folder: Path = Path("runs/sweep")) -> None:
@@ -26,7 +25,7 @@ def main(steps: int = 2_000, folder: Path = Path("runs/sweep")) -> None:
     cells = make_cells(["momba", "her"], ["MO-HalfCheetah-v4", "MO-Hopper-v4"], seeds=2, options=options, auto_ent_coef=0.01)
     for name, error in run_sweep(cells, folder).items():
         print(f"{name} failed:\n{error}")
-    records = [read_record(path) for path in find_records([folder])]
+    records = read_begun([folder])
     print(write_report(compare(records), records, folder))
     print(f"Written to {folder / 'report.md'}.")
 

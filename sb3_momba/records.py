@@ -111,16 +111,19 @@ class RecordWriter:
         self.append("end", status="finished", steps=steps, **content, front=front)
         self.is_ended = True
 
+    def fail(self, error: str, traceback: str = "") -> None:
+        """:param error: one line; `traceback`: where it came from"""
+        self.is_ended = True
+        self.append("end", status="failed", error=error, traceback=traceback)
+
     def __enter__(self) -> "RecordWriter":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         with self.file:
             if isinstance(error, Exception) and not self.is_ended:
-                self.is_ended = True
-                lines = format_exception(error)
-                text = f"{type(error).__name__}: {error}".removesuffix(": ")
-                self.append("end", status="failed", error=text, traceback="".join(lines))
+                message = f"{type(error).__name__}: {error}".removesuffix(": ")
+                self.fail(message, "".join(format_exception(error)))
 
 
 def _provenance() -> dict[str, Any]:

@@ -107,7 +107,8 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
     :raises ValueError: for settings that cannot be
     """
     check_hyperparameters(settings.policy, settings.hyperparameters)
-    check_whole("steps", settings.steps, 1)
+    for name in ("steps", "checkpoint_freq", "keep_checkpoints"):
+        check_whole(name, getattr(settings, name), 1)
     hyperparameters = hyperparameters_of(settings)
     folder = Path(settings.output)
     make_one = partial(make_env, settings.env, settings.env_kwargs)
@@ -202,20 +203,20 @@ def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running
     path = folder / RECORD_NAME
     if not path.is_file():
         raise ValueError(f"{folder} holds no run: give the folder that a run was started with as its --output.")
-    found = read_record(path)
-    if found.error is None:
-        raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
-    if not checkpoints_in(folder / CHECKPOINTS):
-        raise ValueError(f"{folder} holds a run that was cut off before its first checkpoint: delete it, and start it again.")
-    settings = RunSettings(**{**found.config, **running, "output": str(folder)})
-    with (
-        alone_in(folder),
-        prepared(settings, resumed=True) as ready,
-        ready.record.resume(ready.model.num_timesteps) as record,
-    ):
-        name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
-        ready.model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]))
-        return _train(settings, ready, record, ready.model.remaining_timesteps, on_step)
+    with alone_in(folder):
+        found = read_record(path)
+        if found.error is None:
+            raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
+        if not checkpoints_in(folder / CHECKPOINTS):
+            raise ValueError(
+                f"{folder} holds a run that was cut off before its first checkpoint: delete it, and start it again."
+            )
+        settings = RunSettings(**{**found.config, **running, "output": str(folder)})
+        with prepared(settings, resumed=True) as ready, ready.record.resume(ready.model.num_timesteps) as record:
+            name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
+            outputs = [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]
+            ready.model.set_logger(Logger(str(folder), outputs))
+            return _train(settings, ready, record, ready.model.remaining_timesteps, on_step)
 
 
 class StepCallback(BaseCallback):
@@ -249,15 +250,17 @@ def _train(
     return RunResult(evaluation.front, evaluation.timesteps, evaluation.metrics, floors, folder)
 
 
-def record_failure(settings: RunSettings, error: str) -> None:
+def record_failure(settings: RunSettings, error: str, traceback: str = "") -> None:
     """A record in the run's folder of a run that died before it could begin one."""
     n_objectives = probe_environment(settings.env, settings.env_kwargs).n_objectives
     reference_point = settings.reference_point or protocol.reference_point_of(settings.env, n_objectives)
     preferences = preferences_of(settings, n_objectives)
-    record = RecordWriter(Path(settings.output) / RECORD_NAME)
-    start = description(settings, recorded_settings(settings), preferences, reference_point, {})
-    with contextlib.suppress(RuntimeError), record.start(**start):
-        raise RuntimeError(error)
+    path = Path(settings.output) / RECORD_NAME
+    path.unlink(missing_ok=True)  # It may have been cut off in its first line.
+    with RecordWriter(path).start(
+        **description(settings, recorded_settings(settings), preferences, reference_point, {})
+    ) as record:
+        record.fail(error, traceback)
 
 
 class Described(Protocol):

@@ -21,12 +21,12 @@ import yaml
 from scipy.spatial import ConvexHull
 
 from sb3_momba import records, runs, train
-from sb3_momba.benchmark import grid, speed
+from sb3_momba.benchmark import local, speed
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.cells import Cell, has_to_run, make_cells
-from sb3_momba.benchmark.grid import run_grid
-from sb3_momba.benchmark.report import median_run, write_report
-from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on
+from sb3_momba.benchmark.grid import Cell, has_to_run, make_cells
+from sb3_momba.benchmark.local import run_grid
+from sb3_momba.benchmark.report import write_report
+from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on, median_run
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text
 from sb3_momba.files import FileFormatError, alone_in
@@ -1197,11 +1197,11 @@ class FakeTraining:
         self.seeds.append(settings.seed)
         self.environments.append(env or dict(os.environ))
         folder = Path(settings.output)
-        assert not folder.exists() or not any(folder.iterdir()), "a training refuses this folder"
+        runs.check_empty(folder)  # A training refuses others.
         outcome = self.outcome.get(settings.seed, "finishes")
         stdout.write(outcome.encode())
-        if outcome == "does not start":
-            return SimpleNamespace(returncode=1)
+        if outcome in ("does not start", "is interrupted"):
+            return SimpleNamespace(returncode=1 if outcome == "does not start" else 130)
         error = {"fails": BAD, "is cut off": "cut off"}.get(outcome)
         config = runs.recorded_settings(settings)
         write_record(
@@ -1375,6 +1375,31 @@ def test_options_are_handed_on(training, tmp_path, monkeypatch) -> None:
     assert not settings.progress_bar
 
 
+def test_a_run_that_is_interrupted_while_it_starts_has_not_failed(training, tmp_path) -> None:
+    (cell,) = make_cells(["momba"], [ENV], 1)
+    training({0: "is interrupted"})
+    assert run_grid([cell], tmp_path) == {cell.name: "no record: it never began"}
+    again = training()
+    assert run_grid([cell], tmp_path) == {}
+    assert again.seeds == [0]
+
+
+def test_an_interrupted_grid_begins_nothing_more(tmp_path, monkeypatch, capsys) -> None:
+    begun: list[Any] = []
+
+    def interrupted(command: Any, **kwargs: Any) -> None:
+        begun.append(command)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "run", interrupted)
+    line = f"run --conf momba --env {ENV} --seeds 5 --processes 1 --output {tmp_path}"
+    with pytest.raises(SystemExit) as stop:
+        main(line.split())
+    assert stop.value.code == 130
+    assert "Interrupted" in capsys.readouterr().err
+    assert len(begun) <= 2
+
+
 def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
     conf = tmp_path / "tiny.yml"
     entry = {"learning_starts": 50, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
@@ -1389,7 +1414,7 @@ def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
     assert record.start["machine"]["torch_threads"] == 1
     assert (folder / "model.zip").exists()
 
-    monkeypatch.setattr(grid.subprocess, "run", lambda *args, **kwargs: pytest.fail("it is run again"))
+    monkeypatch.setattr(local.subprocess, "run", lambda *args, **kwargs: pytest.fail("it is run again"))
     main([*line.split(), *options.split()])
     main(["report", str(tmp_path / "grid")])
     text = (tmp_path / "grid" / "report.md").read_text()

@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 import sb3_momba
 from sb3_momba import records
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.chapter4 import cells
-from sb3_momba.benchmark.chapter4.cells import MOMBA
+from sb3_momba.benchmark.chapter4 import layout
 from sb3_momba.benchmark.chapter4.command import write_chapter
 from sb3_momba.benchmark.chapter4.differences import differences, missing_note, steps_note
 from sb3_momba.benchmark.chapter4.figure31 import predicted, reset_observations
+from sb3_momba.benchmark.chapter4.layout import MOMBA
 from sb3_momba.benchmark.chapter4.scores import (
     aggregate,
     aggregate_curve,
@@ -103,14 +103,14 @@ def cells_of(table: str) -> list[list[str]]:
 
 def test_the_thesis_has_a_value_for_every_cell() -> None:
     thesis = read_thesis()
-    assert set(thesis.methods) == set(cells.MAIN)
-    assert set(thesis.conditioning) == set(cells.CONDITIONING)
-    assert set(thesis.improvements) == set(cells.IMPROVEMENTS)
+    assert set(thesis.methods) == set(layout.MAIN)
+    assert set(thesis.conditioning) == set(layout.CONDITIONING)
+    assert set(thesis.improvements) == set(layout.IMPROVEMENTS)
     assert len(thesis.tasks) == 7
     published = [*thesis.conditioning.values(), *(one for row in thesis.improvements.values() for one in row.values())]
     for task in thesis.tasks.values():
         for metric in ("hypervolume", "expected_utility"):
-            assert set(task.scores[metric]) == set(cells.MAIN)
+            assert set(task.scores[metric]) == set(layout.MAIN)
             published += task.scores[metric].values()
     assert len(published) == 4 + 8 + 7 * 2 * 5
     assert all(one.low <= one.value <= one.high for one in published)
@@ -128,7 +128,7 @@ def test_some_published_values() -> None:
 
 def test_cells_name_every_shipped_configuration_of_the_thesis() -> None:
     ours = {"capql_uniform", "actor_blocks_1", "alpha_start_1e-3", "alpha_start_1e-2", "alpha_start_5e-2", "bfloat16"}
-    assert cells.all_labels() - BASELINES == set(shipped_configurations()) - ours
+    assert layout.all_labels() - BASELINES == set(shipped_configurations()) - ours
 
 
 def settings_of_configuration(label: str) -> dict[str, Any]:
@@ -139,7 +139,7 @@ def settings_of_configuration(label: str) -> dict[str, Any]:
 
 
 def test_labels_that_one_cell_accepts_are_one_configuration() -> None:
-    groups = [*cells.VALUES.values(), *cells.SCALING.values()]
+    groups = [*layout.VALUES.values(), *layout.SCALING.values()]
     shared = {labels for methods in groups for labels in methods.values() if len(labels) > 1}
     assert len(shared) > 3
     for labels in shared:
@@ -266,7 +266,7 @@ def test_table_4_3_by_hand(fake) -> None:
     values = np.array(FRONT) * 1_000
     made = [fake("momba", values), fake("momba", None, error=BAD, seed=1), fake("pgmorl", values, general_policy=False)]
     rows = {tuple(row[:3]): row[3:] for row in cells_of(table_4_3(tasks_of(made)))}
-    assert rows["environment", "metric", "of"] == list(cells.MAIN)
+    assert rows["environment", "metric", "of"] == list(layout.MAIN)
     # A hypervolume of 6e6 and one of 0; an expected utility of 8e3 / 3 and that of the worst floor, 0.5.
     assert rows["Hopper-v4", "HV / 10^7", "records"] == ["0.3 [0, 0.6]", "**0.6**", *["missing"] * 3]
     assert rows["Hopper-v4", "EUM / 10^3", "records"] == ["1.334 [0.0005, 2.667]", "**2.667**", *["missing"] * 3]
@@ -372,7 +372,7 @@ def test_runs_of_fixed_preferences_form_one_front(fake, fixed, tmp_path) -> None
 def test_the_report_of_any_task_says_that_fixed_preferences_are_not_in_it(fake, fixed, tmp_path) -> None:
     made = [fake("momba", FRONT), fixed([1.0, 3.0], [0.0, 1.0]), fixed([1.0, 1.0], [0.0, 1.0], env=WALKER)]
     text = write_report(compare(made), made, tmp_path)
-    assert text.count("runs of a fixed preference each, 1,") == 2
+    assert text.count("runs of a fixed preference each, 1/1,") == 2
 
 
 def test_sizes_of_critics_are_means_over_the_tasks(fake) -> None:
@@ -432,18 +432,18 @@ def test_shapley_values_need_every_set() -> None:
 
 
 def test_normalisations_are_worth_what_they_come_to_on_tasks_that_have_all(fake) -> None:
-    volumes = dict(zip(cells.NORMALISATION, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), strict=True))
-    made = [fake(labels[0], box(volumes[title])) for title, labels in cells.NORMALISATION.items()]
-    found, common = normalisation_worth(tasks_of(made), cells.NORMALISATION)
+    volumes = dict(zip(layout.NORMALISATION, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), strict=True))
+    made = [fake(labels[0], box(volumes[title])) for title, labels in layout.NORMALISATION.items()]
+    found, common = normalisation_worth(tasks_of(made), layout.NORMALISATION)
     assert common == (HOPPER,)
     assert found[frozenset()] == 1 / 8
     assert found[frozenset({"FN", "WN"})] == 6 / 8
     assert found[frozenset({"FN", "ON", "WN"})] == 1
-    assert set(shapley_values(found)) == set(cells.NORMALISATIONS)
+    assert set(shapley_values(found)) == set(layout.NORMALISATIONS)
     # On another task one is lacking.
-    made += [fake(labels[0], box(1.0), env=WALKER) for labels in list(cells.NORMALISATION.values())[1:]]
-    assert normalisation_worth(tasks_of(made), cells.NORMALISATION) == (found, (HOPPER,))
-    assert normalisation_worth(tasks_of(made[1:]), cells.NORMALISATION) == ({}, ())
+    made += [fake(labels[0], box(1.0), env=WALKER) for labels in list(layout.NORMALISATION.values())[1:]]
+    assert normalisation_worth(tasks_of(made), layout.NORMALISATION) == (found, (HOPPER,))
+    assert normalisation_worth(tasks_of(made[1:]), layout.NORMALISATION) == ({}, ())
 
 
 # ------------------------------------------------------------------------------------------------ what differs from the thesis
@@ -484,7 +484,7 @@ def one_of_each(fake: Callable[..., Record], env: str, n_objectives: int, **star
     """A run of every label of chapter 4, momba's twice, and one of a label that it does not have."""
     made = []
     rng = np.random.default_rng(0)
-    for label in [*sorted(cells.all_labels() - {"fixed_preference"}), "momba", "new"]:
+    for label in [*sorted(layout.all_labels() - {"fixed_preference"}), "momba", "new"]:
         values = rng.uniform(1, 3, (3, n_objectives))
         curve = {100_000: values / 2, 200_000: values * 0.8, 300_000: values}
         made.append(fake(label, values, curve, env=env, general_policy=label not in ("pgmorl", "dpmorl"), **start))

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import io
 import json
 import os
 import shutil
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from uuid import uuid4
 
@@ -18,11 +20,13 @@ import numpy as np
 import psutil
 import pytest
 from ray.cluster_utils import Cluster
+from rich.console import Console
 
 from sb3_momba import runs, train
-from sb3_momba.benchmark import trials
+from sb3_momba.benchmark import grid, trials
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.cells import make_cells
+from sb3_momba.benchmark.grid import make_cells
+from sb3_momba.checkpoints import callback
 from sb3_momba.checkpoints.folders import checkpoints_in
 from sb3_momba.files import alone_in
 from sb3_momba.records import read_record
@@ -167,16 +171,17 @@ def test_what_a_training_raises_ends_it_and_the_others_go_on(tmp_path, capsys) -
 
 
 @pytest.fixture
-def trial(tmp_path, monkeypatch) -> Callable[[], list[dict[str, Any]]]:
+def trial(tmp_path, monkeypatch) -> Callable[..., list[dict[str, Any]]]:
     """Runs one trial in this process; what it reports."""
     reports: list[dict[str, Any]] = []
     monkeypatch.setattr(trials.tune, "report", reports.append)
-    monkeypatch.setattr(trials, "SECONDS_FOR_A_LOCK", 0.1)
+    monkeypatch.setattr(grid, "SECONDS_FOR_A_LOCK", 0.1)
     (cell,) = make_cells(["momba"], [ENV], 1, TINY.format(steps=300).split())
     settings = train.parse(cell.arguments(tmp_path / "sweep" / cell.name))
 
-    def run() -> list[dict[str, Any]]:
-        trials.train_cell({"trial": {"cell": cell, "output": str(tmp_path / "sweep"), "settings": settings}})
+    def run(retry_failed: bool = False) -> list[dict[str, Any]]:
+        about_all = {"output": str(tmp_path / "sweep"), "retry_failed": retry_failed}
+        trials.train_cell({"trial": {"cell": cell, "settings": settings, **about_all}})
         return reports
 
     return run
@@ -202,17 +207,66 @@ def test_a_run_that_another_process_still_writes_is_left_alone(tmp_path, trial) 
         assert [file.name for file in folder.iterdir()] == [".lock"]
 
 
-def test_a_full_disk_ends_a_trial_and_the_next_sweep_begins_it_again(tmp_path, trial, monkeypatch) -> None:
-    def full(*args: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+def test_a_run_that_has_ended_is_not_begun_again(tmp_path, trial) -> None:
+    """Ray begins a trial again whose process died after its last line."""
+    path = tmp_path / "sweep" / RUNS[0] / "record.jsonl"
+    with alone_in(tmp_path / "sweep"):
+        trial()
+        before = path.read_bytes()
+        assert trial()[-1] == {"steps": 0}
+    assert path.read_bytes() == before
 
+
+def test_a_full_disk_ends_a_trial_which_goes_on_from_its_checkpoint_when_asked(tmp_path, trial, monkeypatch) -> None:
+    folder = tmp_path / "sweep" / RUNS[0]
+
+    def full(*args: Any) -> None:
+        if checkpoints_in(folder / "checkpoints"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(*args)
+
+    real = callback.write_checkpoint
     with alone_in(tmp_path / "sweep"):
         with monkeypatch.context() as patch:
-            patch.setattr(runs, "run", full)
+            patch.setattr(callback, "write_checkpoint", full)
             assert "No space left on device" in trial()[-1]["error"]
-        assert not ended(tmp_path / "sweep" / RUNS[0])
+        assert grid.state_of(folder) == "failed"
         trial()
-        assert ended(tmp_path / "sweep" / RUNS[0])
+        assert grid.state_of(folder) == "failed"  # A failure is not tried again unasked.
+        trial(retry_failed=True)
+    assert ended(folder)
+    assert '"resumed", "steps": 100' in (folder / "record.jsonl").read_text()
+
+
+def test_what_cannot_begin_leaves_a_record_of_its_failure(tmp_path, trial, monkeypatch) -> None:
+    def fails(*args: Any) -> None:
+        raise MemoryError("too large")
+
+    monkeypatch.setattr(runs, "run", fails)
+    with alone_in(tmp_path / "sweep"):
+        assert "too large" in trial()[-1]["error"]
+    record = read_record(tmp_path / "sweep" / RUNS[0] / "record.jsonl")
+    assert record.error == "it did not start: too large"
+    assert "MemoryError: too large" in record.traceback
+
+
+def test_the_table_says_what_runs_where_and_how_far() -> None:
+    def fake(name: str, status: str, **result: Any) -> Any:
+        trial = {"cell": SimpleNamespace(name=name), "settings": SimpleNamespace(steps=30_000)}
+        return SimpleNamespace(config={"trial": trial}, status=status, last_result=result, num_failures=2)
+
+    watch = trials.Watch(5)
+    watch.on_trial_complete(1, [], fake("ends well", "TERMINATED"))
+    watch.on_trial_complete(1, [], fake("ends badly", "TERMINATED", error="Traceback\nValueError: nan"))
+    running = fake("goes on", "RUNNING", node_ip="10.0.0.7", pid=4321, steps=12_000)
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(watch.table([running, fake("begins", "RUNNING"), fake("waits", "PENDING")]))
+    said = " ".join(console.export_text().split())
+    assert "2 of 5 runs have ended, 1 failed" in said
+    assert "goes on │ 10.0.0.7 │ 4321 │ 12,000 │ 30,000 │ 2" in said
+    assert "begins" in said
+    assert "waits" not in said
+    assert watch.errors == {"ends badly": "Traceback\nValueError: nan"}
 
 
 BAD = {
@@ -220,7 +274,6 @@ BAD = {
     "an option that the training does not have": (["--stepz", "3"], "--stepz"),
     "an address without a port": (["--address", "somewhere"], 'give "host:port"'),
     "an address where nothing answers": (["--address", "127.0.0.1:9"], "No Ray cluster answers at 127.0.0.1:9"),
-    "no cluster on this machine": (["--address", "auto"], "cannot be reached"),
     "no workers": (["--workers", "0"], "workers=0"),
     "no threads": (["--threads", "0"], "threads=0"),
     "less than no GPU": (["--gpus", "-1"], "gpus=-1"),
@@ -237,12 +290,21 @@ def test_bad_input_ends_with_one_line_of_error(tmp_path, capsys, monkeypatch, op
     assert not list(tmp_path.rglob("*.jsonl"))
 
 
+def test_no_cluster_on_this_machine_is_one_line_of_error(tmp_path, monkeypatch) -> None:
+    def finds_none(**kwargs: Any) -> None:
+        raise ConnectionError("Could not find any running Ray instance.")
+
+    monkeypatch.setattr(trials.ray, "init", finds_none)
+    with pytest.raises(SystemExit, match="error: Ray at 'auto' cannot be reached: Could not find any running"):
+        main([*sweep_arguments(tmp_path), "--address", "auto"])
+
+
 def test_what_no_node_can_run_is_refused(tmp_path, monkeypatch) -> None:
     nodes = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": False, "Resources": {"CPU": 16.0, "GPU": 1.0}}]
     monkeypatch.setattr(trials.ray, "nodes", lambda: nodes)
     for threads, gpus in ((8, 0.0), (1, 0.5)):
         with pytest.raises(ValueError, match=f"threads={threads}, gpus={gpus}: no node has as many"):
-            trials.run_trials([], {}, tmp_path, None, threads, gpus, 0)
+            trials.run_trials([], {}, tmp_path, None, threads, gpus, 0, False)
 
 
 def test_two_sweeps_on_one_folder_are_refused(tmp_path) -> None:

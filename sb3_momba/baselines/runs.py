@@ -195,12 +195,14 @@ def check(settings: BaselineSettings) -> None:
         pass
 
 
-def record_failure(settings: BaselineSettings, error: str) -> None:
+def record_failure(settings: BaselineSettings, error: str, traceback: str = "") -> None:
     """A record in the run's folder of a run that died before it could begin one."""
     with prepared(settings) as ready:
         start = _start(settings, ready)
-    with contextlib.suppress(RuntimeError), RecordWriter(Path(settings.output) / FILE_NAME).start(**start):
-        raise RuntimeError(error)
+    path = Path(settings.output) / FILE_NAME
+    path.unlink(missing_ok=True)  # It may have been cut off in its first line.
+    with RecordWriter(path).start(**start) as record:
+        record.fail(error, traceback)
 
 
 def recorded_settings(settings: BaselineSettings) -> dict[str, Any]:

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import gymnasium as gym
 
-from sb3_momba.benchmark import floors, grid, report, speed, sweep
+from sb3_momba.benchmark import floors, local, report, speed, sweep
 from sb3_momba.benchmark.chapter4 import command as chapter4
 from sb3_momba.benchmark.chapter4 import figure31
+from sb3_momba.envs.workers import WorkerError
 
 COMMANDS = {
-    "run": (grid, "train a grid of runs"),
+    "run": (local, "train a grid of runs"),
     "sweep": (sweep, "train a grid of runs on Ray"),
     "report": (report, "compare records"),
     "chapter4": (chapter4, "the thesis's tables and figures of records"),
@@ -34,8 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     try:
         module.main(given, *([rest] if given.command in HAND_ON else []))
-    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+    except (ValueError, OSError, MemoryError, ImportError, WorkerError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("\nInterrupted: the same command goes on.", file=sys.stderr)
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -1,68 +1,423 @@
-"""Every configuration on every environment with every seed, each run in a process of its own.
+"""What a grid of runs consists of: every configuration on every environment with every seed, and which of them have ended.
 
-A cell whose run ended, well or badly, is not run again; one that was cut off is. So the same command goes on where it stopped.
+A grid is a yaml file:
+
+    variants: [momba, capql, gpi_ls] # shipped configurations, yaml files, or baselines
+    tasks: [MO-Hopper-v4]            # environment ids
+    seeds: 10                        # they are 0 to 9
+    options: {eval_freq: 20_000}     # of `python -m sb3_momba.train`; none by default
+    auto_ent_coef: 0.01              # where variants that learn alpha start it; by default their own
+    fixed_preferences: {2: 20}       # by number of objectives: one run of a single variant for each of so many (section 4.2.4)
 """
 
 import argparse
-import logging
-import os
-import subprocess
+import contextlib
+import json
+import shutil
 import sys
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from importlib import resources
 from pathlib import Path
-from typing import Any
+from textwrap import indent
+from typing import Any, Literal
 
-from sb3_momba.benchmark import cells
-from sb3_momba.benchmark.cells import Cell
-from sb3_momba.files import alone_in
-from sb3_momba.records import FILE_NAME, is_cut_off_at_its_start, read_record
+import yaml
 
-logger = logging.getLogger(__name__)
+from sb3_momba import runs, train
+from sb3_momba.baselines import __main__ as baselines
+from sb3_momba.baselines import runs as baseline_runs
+from sb3_momba.baselines.settings import VARIANTS
+from sb3_momba.benchmark.results import FIXED_PREFERENCE, flat
+from sb3_momba.checkpoints.folders import newest
+from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.files import LOCK, FolderInUseError, alone_in
+from sb3_momba.pareto.evaluation import probe_environment
+from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
+from sb3_momba.runs import CHECKPOINTS
+from sb3_momba.settings import check_names, is_number, nearest, parse_ent_coef
+from sb3_momba.zoo.configuration import literal, read_configuration, with_later_settings
+
+SHIPPED = resources.files("sb3_momba.benchmark") / "grids"
+SECONDS_FOR_A_LOCK = 120.0  # in which the process that has lost a cell notices it and ends
+
+State = Literal["not begun", "cut off", "failed", "finished"]
+Runner = Callable[[Sequence["Cell"], Mapping[str, Any]], dict[str, str]]
 
 
-def run_grid(grid: Sequence[Cell], output: Path, processes: int = 2, retry_failed: bool = False) -> dict[str, str]:
-    """Run what has not ended yet; the names of the runs that failed, now or before, each with what is known of it.
+def _is_list_of_names(x: Any) -> bool:
+    return isinstance(x, list) and len(x) > 0 and all(isinstance(name, str) for name in x)
 
+
+def _are_options(x: Any) -> bool:
+    return isinstance(x, dict) and all(
+        isinstance(name, str) and name.replace("_", "-") not in OF_THE_GRID and value is not None and value is not False
+        for name, value in x.items()
+    )
+
+
+def _is_number_of(x: Any) -> bool:
+    return isinstance(x, int) and not isinstance(x, bool)
+
+
+# Each cell has its own.
+OF_THE_GRID = ("seed", "output", "env", "conf", "label", "resume")
+# What a grid's entries must be.
+ENTRIES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "variants": (_is_list_of_names, "a list of names"),
+    "tasks": (_is_list_of_names, "a list of names"),
+    "seeds": (_is_number_of, "a whole number"),
+    "options": (_are_options, f"a mapping of options with their values, none of {', '.join(OF_THE_GRID)}"),
+    "auto_ent_coef": (is_number, "a number"),
+    "fixed_preferences": (
+        lambda x: isinstance(x, dict) and all(map(_is_number_of, [*x, *x.values()])),
+        "a mapping of whole numbers",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Program:
+    """What trains a cell.
+
+    :param module: of its command line, `python -m module`
+    :param parse: what reads that
+    :param runs: module with `check`, `run`, `recorded_settings` and `record_failure` of the settings
+    """
+
+    module: str
+    parse: Callable[[Sequence[str]], Any]
+    runs: Any
+
+
+MOMBA = Program("sb3_momba.train", train.parse, runs)
+BASELINES = Program("sb3_momba.baselines", baselines.parse, baseline_runs)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run.
+
+    :param conf: yaml file or name of a shipped configuration, or a baseline's name
+    :param options: further ones of `python -m sb3_momba.train` or `python -m sb3_momba.baselines`
+    :param method: first part of the cell's name; by default the configuration's
+    """
+
+    conf: str
+    env: str
+    seed: int
+    options: tuple[str, ...] = field(default=())
+    method: str = ""
+
+    @property
+    def name(self) -> str:
+        return f"{self.method or Path(self.conf).stem}/{self.env}/{self.seed}"
+
+    @property
+    def program(self) -> Program:
+        return BASELINES if self.conf in VARIANTS else MOMBA
+
+    def arguments(self, folder: Path) -> list[str]:
+        """Of its program."""
+        where = ["--env", self.env, "--seed", str(self.seed), "--output", str(folder)]
+        if self.program is BASELINES:
+            return [self.conf, *self.options, *where]
+        return [*self.options, "--conf", self.conf, *where, "--no-progress-bar"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A yaml file's entries; see the module's docstring."""
+
+    variants: list[str]
+    tasks: list[str]
+    seeds: int
+    options: dict[str, Any] = field(default_factory=dict)
+    auto_ent_coef: float | None = None
+    fixed_preferences: dict[int, int] = field(default_factory=dict)
+
+
+def shipped_grids() -> list[str]:
+    """Names of the grids that come with the package."""
+    return sorted(file.name.removesuffix(".yml") for file in SHIPPED.iterdir() if file.name.endswith(".yml"))
+
+
+def read_grid(name: str) -> Grid:
+    """
+    :param name: a yaml file, or the name of a shipped grid
+    :raises ValueError: for neither, for what is no yaml, and for entries that a grid does not have, lacks or cannot take
+    """
+    file = SHIPPED / f"{name}.yml" if name in shipped_grids() else Path(name)
+    if not file.is_file():
+        raise ValueError(f"{name!r} is neither a yaml file nor a shipped grid{nearest(name, shipped_grids())}")
+    try:
+        entries = literal(yaml.safe_load(file.read_text()))
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f"{name} is not valid yaml, or asks for Python objects: {' '.join(str(error).split())}") from error
+    check_names(name, entries, [entry.name for entry in fields(Grid)], "A grid has no entry")
+    for entry in ("variants", "tasks", "seeds"):
+        if entry not in entries:
+            raise ValueError(f"{name} has no {entry}: a grid needs variants, tasks and seeds.")
+    for entry, (fits, description) in ENTRIES.items():
+        if entry in entries and not fits(entries[entry]):
+            raise ValueError(f"{name}: {entry} is {entries[entry]!r}; it must be {description}.")
+    return Grid(**entries)
+
+
+def as_arguments(options: Mapping[str, Any]) -> list[str]:
+    """{"steps": 300, "set": {"gamma": 0.9}, "her": True} -> --steps 300 --set gamma=0.9 --her"""
+    words: list[str] = []
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(value, dict):
+            for key, item in value.items():
+                words += [option, f"{key}={item if isinstance(item, str) else json.dumps(item)}"]
+        elif isinstance(value, list):
+            words += [option, *map(str, value)]
+        else:
+            words += [option] if value is True else [option, str(value)]
+    return words
+
+
+def make_cells(
+    confs: Sequence[str],
+    envs: Sequence[str],
+    seeds: int,
+    options: Sequence[str] = (),
+    auto_ent_coef: float | None = None,
+    fixed_preferences: Mapping[int, int] | None = None,
+) -> list[Cell]:
+    """Seeds vary slowest, so that whatever is finished compares all methods.
+
+    :param seeds: how many
+    :param auto_ent_coef: where configurations that learn alpha start it, all alike
+    :param fixed_preferences: by number of objectives how many preferences, each with a run of its own
+    :raises ValueError: for a configuration that does not exist, or two of one name
+    """
+    for option in ("--seed", "--output"):
+        if any(given.split("=")[0] == option for given in options):
+            raise ValueError(f"{option} is the grid's own for each run: give --seeds and the grid's --output.")
+    if seeds < 1:
+        raise ValueError(f"seeds={seeds}: at least one is needed.")
+    cells: list[Cell] = []
+    for seed in range(seeds):
+        for env in dict.fromkeys(envs):
+            for conf in dict.fromkeys(confs):
+                learned = learns_alpha(conf, env)
+                start = ("--ent-coef", f"auto_{auto_ent_coef}") if auto_ent_coef is not None and learned else ()
+                cell = Cell(conf, env, seed, (*start, *options))
+                cells += _with_fixed_preferences(cell, fixed_preferences) if fixed_preferences else [cell]
+    return merged(cells)
+
+
+def learns_alpha(conf: str, env: str) -> bool:
+    """:raises ValueError: for a configuration that does not exist"""
+    if conf in VARIANTS:
+        return False
+    learned, _ = parse_ent_coef(read_configuration(conf, env).hyperparameters.get("ent_coef", "auto"))
+    return learned
+
+
+def _with_fixed_preferences(cell: Cell, numbers: Mapping[int, int]) -> list[Cell]:
+    n_objectives = probe_environment(cell.env).n_objectives
+    if n_objectives not in numbers:
+        raise ValueError(f"fixed_preferences={dict(numbers)}: {cell.env} has {n_objectives} objectives; say how many for it.")
+    return [
+        Cell(
+            cell.conf,
+            cell.env,
+            cell.seed,
+            (*cell.options, "--label", FIXED_PREFERENCE, "--preference", *map(str, preference)),
+            f"{FIXED_PREFERENCE}-{number:02}",
+        )
+        for number, preference in enumerate(preference_grid(n_objectives, numbers[n_objectives]).tolist())
+    ]
+
+
+def merged(cells: Iterable[Cell]) -> list[Cell]:
+    """Each cell once.
+
+    :raises ValueError: for two different ones of one name
+    """
+    by_name: dict[str, Cell] = {}
+    for cell in cells:
+        other = by_name.setdefault(cell.name, cell)
+        if other.conf != cell.conf:
+            raise ValueError(f"{other.conf} and {cell.conf} have one name, {cell.name}: rename one of them.")
+        if other != cell:
+            raise ValueError(
+                f"{cell.name} is asked for with {' '.join(other.options) or 'no options'} and with "
+                f"{' '.join(cell.options) or 'no options'}: run these grids in folders of their own."
+            )
+    return list(by_name.values())
+
+
+def checked(cells: Sequence[Cell], output: Path) -> dict[str, Any]:
+    """What the program of each cell reads from its arguments, by the cell's name.
+
+    :raises ValueError: for settings that cannot be
+    :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
+    """
+    settings = {cell.name: cell.program.parse(cell.arguments(output / cell.name)) for cell in cells}
+    one_of_each = {(cell.conf, cell.env, cell.method): cell for cell in cells}.values()
+    for cell in one_of_each:
+        cell.program.runs.check(settings[cell.name])
+    by_settings: dict[str, Cell] = {}
+    for cell in one_of_each:
+        if cell.program is MOMBA:
+            same = json.dumps({**cell.program.runs.recorded_settings(settings[cell.name]), "label": None}, sort_keys=True)
+            other = by_settings.setdefault(same, cell)
+            if other is not cell:
+                raise ValueError(
+                    f"{other.name} and {cell.name} have the same settings: leave one of them out, or the option that makes "
+                    "them alike, such as --auto-ent-coef."
+                )
+    return settings
+
+
+def state_of(folder: Path) -> State:
+    """What has come of a run, by its record."""
+    record = folder / FILE_NAME
+    if not record.exists() or is_cut_off_at_its_start(record):
+        return "not begun"
+    error = read_record(record).error
+    return "finished" if error is None else "cut off" if error == UNENDED else "failed"
+
+
+def has_to_run(cell: Cell, settings: Any, retry_failed: bool = False) -> bool:
+    """Whether a cell never ran, was cut off, or failed and is to be tried again.
+
+    :raises ValueError: if its folder holds anything but a run with these settings
+    """
+    folder = Path(settings.output)
+    state = state_of(folder)
+    if state == "not begun":
+        if folder.exists() and (not folder.is_dir() or any(file.name not in (FILE_NAME, LOCK) for file in folder.iterdir())):
+            raise ValueError(f"{folder} holds something else than a run: choose another --output.")
+        return True
+    config = read_record(folder / FILE_NAME).config
+    theirs, ours = flat(with_later_settings(config)), flat(cell.program.runs.recorded_settings(settings))
+    differing = sorted(name for name in {*theirs, *ours} if theirs.get(name) != ours.get(name))
+    if differing:
+        raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
+    return state == "cut off" or (state == "failed" and retry_failed)
+
+
+def way_to_run(folder: Path, retry_failed: bool = False) -> Literal["begin", "go on"] | None:
+    """How the process that got a cell runs it: from a checkpoint, or from the start, for which its folder is emptied; None:
+    it has ended meanwhile.
+
+    :raises FolderInUseError: if a process that had lost the cell still writes into the folder after two minutes
+    :raises FileFormatError: if there are checkpoints, and none can be read
+    """
+    with alone_soon_in(folder):
+        state = state_of(folder)
+        if state == "finished" or (state == "failed" and not retry_failed):
+            return None
+        if state != "not begun":
+            with contextlib.suppress(FileNotFoundError):
+                newest(folder / CHECKPOINTS)
+                return "go on"
+        for path in folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.name != LOCK:
+                path.unlink()
+        return "begin"
+
+
+@contextlib.contextmanager
+def alone_soon_in(folder: Path) -> Iterator[None]:
+    """`alone_in`, once the process that is there has ended."""
+    until = time.monotonic() + SECONDS_FOR_A_LOCK
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(alone_in(folder))
+                break
+            except FolderInUseError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.5)
+        yield
+
+
+def run_cells(cells: Sequence[Cell], output: Path, runner: Runner, retry_failed: bool = False) -> dict[str, str]:
+    """Run what has not ended yet; the names of the cells that did not finish, now or before, each with what is known of it.
+
+    :param runner: of the cells that have to run, with what their programs have read, by name; gives what those that did not
+        finish have said last
     :param retry_failed: run again what failed
     :raises ValueError: for settings that cannot be, a folder that holds something else or where another grid runs, before
         anything runs
     :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
-    if processes < 1:
-        raise ValueError(f"processes={processes}: at least one is needed.")
-    settings = cells.checked(grid, output)
-    with alone_in(output), ThreadPoolExecutor(processes) as pool:
-        waiting = [cell for cell in grid if cells.has_to_run(cell, settings[cell.name], retry_failed)]
-        list(pool.map(lambda cell: _run_cell(cell, settings[cell.name]), waiting))
-    return cells.failed(grid, output)
+    settings = checked(cells, output)
+    with alone_in(output):
+        waiting = [cell for cell in cells if has_to_run(cell, settings[cell.name], retry_failed)]
+        said = runner(waiting, settings) if waiting else {}
+        return {name: said.get(name, error) for name, error in failed(cells, output).items()}
 
 
-def _run_cell(cell: Cell, settings: Any) -> None:
-    logger.info("%s starts", cell.name)
-    folder = Path(settings.output)
-    goes_on = cells.goes_on(folder)
-    arguments = ["--resume", str(folder), "--no-progress-bar"] if goes_on else cell.arguments(folder)
-    command = [sys.executable, "-m", cell.program.module, *arguments]
-    with open(cells.log_of(folder), "ab" if goes_on else "wb") as log:
-        # Runs side by side share the cores: one thread each.
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
-    record = folder / FILE_NAME
-    if not record.exists() or is_cut_off_at_its_start(record):
-        record.unlink(missing_ok=True)
-        said = [line for line in cells.log_of(folder).read_text(errors="replace").splitlines() if line.strip()]
-        cell.program.runs.record_failure(settings, f"it did not start: {said[-1] if said else 'no output'}")
-    error = read_record(record).error
-    logger.info("%s %s", cell.name, "finished" if error is None else f"failed: {error}")
+def log_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.log")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    cells.add_arguments(parser)
-    parser.add_argument("--processes", type=int, default=2, help="runs side by side, one thread each")
+    """Those that say what a grid consists of; see `cells_of`."""
+    parser.add_argument("--grid", nargs="+", default=[], help=f"yaml files, or shipped: {', '.join(shipped_grids())}")
+    parser.add_argument("--conf", nargs="+", default=[], help="instead: shipped configurations, yaml files or baselines")
+    parser.add_argument("--env", nargs="+", default=[], help="environment ids; by default the grid's")
+    parser.add_argument("--seeds", type=int, help="how many, 0, 1, ...; by default the grid's")
+    parser.add_argument("--output", type=Path, required=True, help="folder of the run folders")
+    parser.add_argument("--retry-failed", action="store_true", help="run again what failed")
+    parser.add_argument(
+        "--auto-ent-coef", type=float, help="where every configuration that learns alpha starts it; 0.01 below 200,000 steps"
+    )
+    parser.epilog = "Every other option is handed to python -m sb3_momba.train (or baselines), such as --steps 3e4."
 
 
-def main(given: argparse.Namespace, options: Sequence[str]) -> None:
-    logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
-    failures = run_grid(cells.cells_of(given, options), given.output, given.processes, given.retry_failed)
-    cells.end_with_failures(failures, given.output)
+def cells_of(given: argparse.Namespace, options: Sequence[str]) -> list[Cell]:
+    """What the command line asks for; its own words win over a grid's.
+
+    :raises ValueError: for neither grids nor configurations, or both
+    """
+    if bool(given.grid) == bool(given.conf):
+        raise ValueError("Give either --grid, or --conf with --env and --seeds.")
+    if given.conf and not (given.env and given.seeds is not None):
+        raise ValueError("--conf needs --env and --seeds.")
+    grids = [read_grid(name) for name in given.grid] or [Grid(given.conf, given.env, given.seeds)]
+    cells: list[Cell] = []
+    for grid in grids:
+        cells += make_cells(
+            grid.variants,
+            given.env or grid.tasks,
+            grid.seeds if given.seeds is None else given.seeds,
+            [*as_arguments(grid.options), *options],
+            grid.auto_ent_coef if given.auto_ent_coef is None else given.auto_ent_coef,
+            grid.fixed_preferences,
+        )
+    return merged(cells)
+
+
+def failed(cells: Sequence[Cell], output: Path) -> dict[str, str]:
+    """The cells that did not finish, by name, each with its traceback or, where it left none, its error."""
+    found = {}
+    for cell in cells:
+        state = state_of(output / cell.name)
+        if state == "not begun":
+            found[cell.name] = "no record: it never began"
+        elif state != "finished":
+            record = read_record(output / cell.name / FILE_NAME)
+            found[cell.name] = (record.traceback or str(record.error)).rstrip()
+    return found
+
+
+def end_with_failures(failures: Mapping[str, str], output: Path) -> None:
+    """Print what failed, by name, and leave with an error if anything did."""
+    for name, text in failures.items():
+        print(f"\n{name}\n{indent(text, '    ')}", file=sys.stderr)
+    if failures:
+        names = ", ".join(failures)
+        sys.exit(f"error: {len(failures)} runs failed ({names}); their logs lie beside their folders in {output}.")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from sb3_momba.benchmark.results import Run, Task, compare, curve_on
+from sb3_momba.benchmark.results import Run, Task, compare, curve_on, median_run, parameters_of
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
@@ -57,9 +57,8 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
         parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
         parts += [f"Not recorded: {missing}.\n" for missing in missing_seeds(task)]
         if task.fixed_preference:
-            parts.append(
-                f"Not in the table: runs of a fixed preference each, {len(task.fixed_preference)}, points of one front.\n"
-            )
+            finished = f"{sum(record.error is None for record in task.fixed_preference)}/{len(task.fixed_preference)}"
+            parts.append(f"Not in the table: runs of a fixed preference each, {finished}, points of one front.\n")
         if draw_curves(task, folder / f"curve-{name}.png"):
             parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
         if draw_fronts(task, folder / f"front-{name}.png"):
@@ -107,7 +106,7 @@ def task_table(task: Task) -> str:
     for name, runs in task.methods.items():
         finished = sum(run.is_finished for run in runs)
         steps = max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
-        parameters = sum(runs[0].record.parameters.values())
+        parameters = sum(parameters_of(runs).values())
         scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()]
         known = [[score for score in column if np.isfinite(score)] for column in scores]
         estimates = [as_text(estimate(interquartile_mean, [column])) if column else "" for column in known]
@@ -160,14 +159,19 @@ def normalised(tasks: Sequence[dict[str, list[Run]]], name: str, baseline: str, 
 
 
 def failures(tasks: Sequence[Task]) -> str:
+    named = [(task, name, run.record) for task in tasks for name, runs in task.methods.items() for run in runs]
+    named += [(task, fixed_name(record), record) for task in tasks for record in task.fixed_preference]
     lines = [
-        f"- {task.name}, {name}, seed {run.record.seed}: {one_line(str(run.record.error))}"
-        for task in tasks
-        for name, runs in task.methods.items()
-        for run in runs
-        if not run.is_finished
+        f"- {task.name}, {name}, seed {record.seed}: {one_line(str(record.error))}"
+        for task, name, record in named
+        if record.error is not None
     ]
     return "## Runs that did not finish\n\n" + "\n".join(lines) + "\n" if lines else ""
+
+
+def fixed_name(record: Record) -> str:
+    weights = ", ".join(f"{w:.3g}" for w in record.preferences[0])
+    return f"{record.label} ({weights})"
 
 
 def provenance(records: Sequence[Record]) -> str:
@@ -225,12 +229,6 @@ def draw_fronts(task: Task, path: Path) -> bool:
     objectives = next((names for names in named if names), None)
     plot_front(fronts, path, objectives, task.name)
     return True
-
-
-def median_run(runs: Sequence[Run]) -> Run | None:
-    """The finished run of median hypervolume; of an even number the lower one of the two in the middle."""
-    finished = sorted((run for run in runs if run.is_finished), key=lambda run: run.hypervolume)
-    return finished[(len(finished) - 1) // 2] if finished else None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

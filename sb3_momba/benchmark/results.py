@@ -276,3 +276,14 @@ def areas_over_time(runs: Sequence[Run], seconds: float) -> list[float]:
         )
         areas.append(float(trapezoid(curve, times) / seconds))
     return areas
+
+
+def median_run(runs: Sequence[Run]) -> Run | None:
+    """The finished run of median hypervolume; of an even number the lower one of the two in the middle."""
+    finished = sorted((run for run in runs if run.is_finished), key=lambda run: run.hypervolume)
+    return finished[(len(finished) - 1) // 2] if finished else None
+
+
+def parameters_of(runs: Sequence[Run]) -> dict[str, int]:
+    """Trainable parameters of each network of one method; a run that never began has recorded none."""
+    return next((run.record.parameters for run in runs if run.record.parameters), {})

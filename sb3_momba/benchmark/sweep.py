@@ -8,16 +8,16 @@ under one path, with file locks.
 import argparse
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from sb3_momba.benchmark import cells
-from sb3_momba.benchmark.cells import Cell
-from sb3_momba.files import alone_in
+from sb3_momba.benchmark import grid
+from sb3_momba.benchmark.grid import Cell
 
 
 def run_sweep(
-    grid: Sequence[Cell],
+    cells: Sequence[Cell],
     output: Path,
     address: str | None = None,
     workers: int | None = None,
@@ -26,7 +26,7 @@ def run_sweep(
     max_failures: int = 10,
     retry_failed: bool = False,
 ) -> dict[str, str]:
-    """Run what has not ended yet; the names of the runs that failed, now or before, each with what is known of it.
+    """Run what has not ended yet: see `grid.run_cells`.
 
     :param address: of a Ray cluster, "host:port" or "auto" for the one that this machine is part of; None: this machine alone
     :param workers: runs side by side; by default as many as there are processors for
@@ -35,8 +35,6 @@ def run_sweep(
     :param max_failures: how often a run may lose its process before this sweep gives it up
     :param retry_failed: run again what failed
     :raises ImportError: without Ray
-    :raises ValueError: for settings that cannot be, a folder that holds something else or where another grid runs, before
-        anything runs
     :raises ConnectionError: if no cluster answers
     """
     try:
@@ -51,22 +49,18 @@ def run_sweep(
     ):
         if value is not None and value < least:
             raise ValueError(f"{name}={value}: it must be at least {least}.")
-    if workers is None and address is None:
-        workers = max(1, (os.cpu_count() or 1) // threads)
-    output = output.resolve()
-    settings = cells.checked(grid, output)
-    with alone_in(output):
-        waiting = [cell for cell in grid if cells.has_to_run(cell, settings[cell.name], retry_failed)]
-        said = {}
-        if waiting:
-            with trials.cluster(address, (workers or 1) * threads, threads):
-                said = trials.run_trials(waiting, settings, output, workers, threads, gpus, max_failures)
-        failed = cells.failed(grid, output)
-    return {name: said.get(name, error) for name, error in failed.items()}
+    n = workers or max(1, (os.cpu_count() or 1) // threads)
+
+    def on_ray(waiting: Sequence[Cell], settings: Mapping[str, Any]) -> dict[str, str]:
+        with trials.cluster(address, n * threads, threads):
+            at_most = n if address is None else workers
+            return trials.run_trials(waiting, settings, output.resolve(), at_most, threads, gpus, max_failures, retry_failed)
+
+    return grid.run_cells(cells, output.resolve(), on_ray, retry_failed)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    cells.add_arguments(parser)
+    grid.add_arguments(parser)
     parser.add_argument("--address", help='of a Ray cluster, "host:port" or "auto"; by default this machine alone')
     parser.add_argument("--workers", type=int, help="runs side by side; by default as many as there are processors for")
     parser.add_argument("--threads", type=int, default=1, help="processors of each run")
@@ -77,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(given: argparse.Namespace, options: Sequence[str]) -> None:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     failures = run_sweep(
-        cells.cells_of(given, options),
+        grid.cells_of(given, options),
         given.output,
         given.address,
         given.workers,
@@ -86,4 +80,4 @@ def main(given: argparse.Namespace, options: Sequence[str]) -> None:
         given.max_failures,
         given.retry_failed,
     )
-    cells.end_with_failures(failures, given.output)
+    grid.end_with_failures(failures, given.output)

@@ -25,16 +25,15 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from sb3_momba.benchmark import cells
-from sb3_momba.benchmark.cells import Cell
-from sb3_momba.files import LOCK, FolderInUseError, alone_in
+from sb3_momba.benchmark import grid
+from sb3_momba.benchmark.grid import Cell
+from sb3_momba.files import LOCK
 from sb3_momba.runs import resume
 
 STATE = ".tune"  # Ray Tune's own files, in the output folder; nothing is read from them
 OBJECT_STORE_BYTES = 100_000_000  # trials exchange a few numbers
 SECONDS_BETWEEN_REPORTS = 2.0
 SECONDS_FOR_AN_ADDRESS = 10.0
-SECONDS_FOR_A_LOCK = 120.0  # in which the processes of a node that was lost notice it and end
 
 logger = logging.getLogger(__name__)
 
@@ -79,13 +78,14 @@ def _check_answers(address: str) -> None:
 
 
 def run_trials(
-    grid: Sequence[Cell],
+    cells: Sequence[Cell],
     settings: Mapping[str, Any],
     output: Path,
     workers: int | None,
     threads: int,
     gpus: float,
     max_failures: int,
+    retry_failed: bool,
 ) -> dict[str, str]:
     """Run each of these; what those that did not finish have said last, by name.
 
@@ -96,7 +96,8 @@ def run_trials(
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
     if not any(all(node.get(name, 0) >= amount for name, amount in resources.items()) for node in nodes):
         raise ValueError(f"threads={threads}, gpus={gpus}: no node has as many for one run; choose less, or add one.")
-    trials = [{"cell": cell, "settings": settings[cell.name], "output": str(output)} for cell in grid]
+    about_all = {"output": str(output), "retry_failed": retry_failed}
+    trials = [{"cell": cell, "settings": settings[cell.name], **about_all} for cell in cells]
     watch = Watch(len(trials))
     for name in ("ray.tune", "ray.train"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # Lost processes are told of here.
@@ -124,41 +125,32 @@ def run_trials(
 
 def train_cell(config: dict[str, Any]) -> None:
     """One trial. What its training raises ends it; only the death of its process, which raises nothing, lets it begin again."""
-    cell, settings, output = config["trial"]["cell"], config["trial"]["settings"], Path(config["trial"]["output"])
+    trial = config["trial"]
+    cell, settings, output = trial["cell"], trial["settings"], Path(trial["output"])
     folder = output / cell.name
     tune.report({"steps": 0})
     try:
         if not (output / LOCK).exists():
             raise FileNotFoundError(f"{socket.gethostname()} does not see {output}: choose an --output that all nodes share.")
-        _wait_until_free(folder)
-        goes_on = cells.goes_on(folder)
+        way = grid.way_to_run(folder, trial["retry_failed"])
+        if way is None:
+            return
         with (
-            open(cells.log_of(folder), "a" if goes_on else "w", buffering=1) as log,
+            open(grid.log_of(folder), "a" if way == "go on" else "w", buffering=1) as log,
             contextlib.redirect_stdout(log),
             contextlib.redirect_stderr(log),
         ):
-            if goes_on:
-                resume(folder, Progress(), progress_bar=False)
-            else:
-                cell.program.runs.run(settings, Progress())
+            try:
+                if way == "go on":
+                    resume(folder, Progress(), progress_bar=False)
+                else:
+                    cell.program.runs.run(settings, Progress())
+            except Exception as error:
+                if grid.state_of(folder) == "not begun":
+                    cell.program.runs.record_failure(settings, f"it did not start: {error}", traceback.format_exc())
+                raise
     except Exception:
         tune.report({"error": traceback.format_exc()})
-
-
-def _wait_until_free(folder: Path) -> None:
-    """Until the process that has lost this run has ended.
-
-    :raises FolderInUseError: if it does not
-    """
-    until = time.monotonic() + SECONDS_FOR_A_LOCK
-    while True:
-        try:
-            with alone_in(folder):
-                return
-        except FolderInUseError:
-            if time.monotonic() > until:
-                raise
-            time.sleep(1)
 
 
 class Progress:

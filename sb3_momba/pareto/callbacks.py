@@ -58,8 +58,8 @@ class ParetoEvalCallback(EventCallback):
     :param n_workers: processes that share the episodes of an evaluation
     :param verbose: 1 prints a line for each evaluation
     :param preferences: to evaluate instead, (P, n_objectives), each on the simplex
-    :raises ValueError: for eval_freq or n_workers below 1; when the training starts, for what `check` finds, or an eval_env
-        that is the training environment
+    :raises ValueError: for eval_freq, n_episodes or n_workers below 1; when the training starts, for what `check` finds, or an
+        eval_env that is the training environment
     """
 
     def __init__(
@@ -83,6 +83,8 @@ class ParetoEvalCallback(EventCallback):
         super().__init__(callback_after_eval, verbose=verbose)
         if eval_freq < 1:
             raise ValueError(f"eval_freq={eval_freq}: give the number of environment steps between evaluations.")
+        if n_episodes < 1:
+            raise ValueError(f"n_episodes={n_episodes}: at least one episode is needed.")
         if n_workers < 1:
             raise ValueError(f"n_workers={n_workers}: at least one process is needed.")
         self.eval_env = eval_env

@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from sb3_momba.benchmark.chapter4.cells import FIXED, MAIN, Labels, Methods, all_labels
+from sb3_momba.benchmark.chapter4.layout import FIXED, MAIN, Labels, Methods, all_labels
 from sb3_momba.benchmark.chapter4.scores import Tasks, runs_of, settings_of
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
 from sb3_momba.benchmark.results import Run, Task, flat, setting_text
@@ -50,7 +50,7 @@ def not_shown(tasks: Tasks, records: Sequence[Record]) -> list[str]:
     if labels:
         lines.append(
             f"Labels of no table or figure, whose runs only widen the front of Table 4.5: {', '.join(labels)}. "
-            "`cells.py` says which labels are shown.\n"
+            "`layout.py` says which labels are shown.\n"
         )
     return lines
 

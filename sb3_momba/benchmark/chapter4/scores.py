@@ -13,10 +13,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_momba.benchmark.chapter4.cells import MOMBA, NONE, PGMORL, Labels, Methods
+from sb3_momba.benchmark.chapter4.layout import MOMBA, NONE, PGMORL, Labels, Methods
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
 from sb3_momba.benchmark.report import CURVE_REPETITIONS
-from sb3_momba.benchmark.results import Metric, Run, Task, compare, curve_on, is_fixed_preference, method_settings, setting_text
+from sb3_momba.benchmark.results import (
+    Metric,
+    Run,
+    Task,
+    compare,
+    curve_on,
+    is_fixed_preference,
+    method_settings,
+    parameters_of,
+    setting_text,
+)
 from sb3_momba.benchmark.statistics import Estimate, estimate, interquartile_mean
 from sb3_momba.envs.registry import raw_id
 from sb3_momba.records import Record
@@ -216,7 +226,7 @@ def curve_through(steps: Array, tasks: Sequence[Array]) -> Curve:
 
 def critic_parameters(tasks: Tasks, labels: Labels) -> float | None:
     """Of all critics of the ensemble, mean over the tasks; None where no record says so."""
-    sizes = [runs_of(task, labels)[0].record.parameters.get("critic") for task in tasks.values() if runs_of(task, labels)]
+    sizes = [parameters_of(runs_of(task, labels)).get("critic") for task in tasks.values()]
     known = [size for size in sizes if size is not None]
     return float(np.mean(known)) if known else None
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from sb3_momba.benchmark.chapter4 import cells, figures, tables
-from sb3_momba.benchmark.chapter4.cells import Labels, Methods
+from sb3_momba.benchmark.chapter4 import figures, layout, tables
 from sb3_momba.benchmark.chapter4.differences import MISSING, missing_note, names, steps_note
 from sb3_momba.benchmark.chapter4.figures import CurvePanel, FrontPanel
+from sb3_momba.benchmark.chapter4.layout import Labels, Methods
 from sb3_momba.benchmark.chapter4.scores import (
     Array,
     Tasks,
@@ -23,8 +23,7 @@ from sb3_momba.benchmark.chapter4.scores import (
 )
 from sb3_momba.benchmark.chapter4.tables import SHORT, aggregate_cells, aggregate_table, seeds_table, unit_note
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
-from sb3_momba.benchmark.report import median_run
-from sb3_momba.benchmark.results import Metric, Task
+from sb3_momba.benchmark.results import Metric, Task, median_run
 from sb3_momba.benchmark.tables import markdown
 from sb3_momba.pareto.metrics import hypervolume
 
@@ -46,23 +45,23 @@ def file(folder: Path, name: str) -> Path:
 
 def table_4_2(tasks: Tasks, folder: Path) -> str:
     introduction = "Parameters are the mean over the tasks, of a single policy with its critics.\n"
-    return "\n".join([introduction, tables.table_4_2(tasks), notes(tasks, cells.MAIN)])
+    return "\n".join([introduction, tables.table_4_2(tasks), notes(tasks, layout.MAIN)])
 
 
 def figure_4_1(tasks: Tasks, folder: Path) -> str:
     panels, text = {}, []
     for metric, short in SHORT.items():
         unit = main_units(tasks, metric)
-        found = {title: aggregate(tasks, labels, metric, unit) for title, labels in cells.MAIN.items()}
+        found = {title: aggregate(tasks, labels, metric, unit) for title, labels in layout.MAIN.items()}
         panels[f"normalised {short}"] = found
         text += [aggregate_table("algorithm", found, f"normalised {short}"), unit_note(tasks, unit, "PGMORL", metric)]
     is_drawn = figures.draw_estimates(panels, file(folder, "4.1"))
-    return "\n".join([picture("4.1", "Aggregate hypervolume and expected utility", is_drawn), *text, notes(tasks, cells.MAIN)])
+    return "\n".join([picture("4.1", "Aggregate hypervolume and expected utility", is_drawn), *text, notes(tasks, layout.MAIN)])
 
 
 def table_4_3(tasks: Tasks, folder: Path) -> str:
     caution = "Whether the thesis trained on exactly these models of the tasks is not known. The best of a row is bold.\n"
-    return "\n".join([caution, tables.table_4_3(tasks), notes(tasks, cells.MAIN)])
+    return "\n".join([caution, tables.table_4_3(tasks), notes(tasks, layout.MAIN)])
 
 
 def fronts(tasks: Tasks, folder: Path, name: str, title: str, methods: Methods) -> str:
@@ -86,7 +85,7 @@ def median_front(task: Task, labels: Labels) -> Array | None:
 
 
 def figure_4_2(tasks: Tasks, folder: Path) -> str:
-    return fronts(tasks, folder, "4.2", "Fronts of all methods", cells.MAIN)
+    return fronts(tasks, folder, "4.2", "Fronts of all methods", layout.MAIN)
 
 
 def figure_4_3(tasks: Tasks, folder: Path) -> str:
@@ -94,7 +93,7 @@ def figure_4_3(tasks: Tasks, folder: Path) -> str:
         CurvePanel(
             read_thesis().tasks[env].name,
             short,
-            {title: curve_of(runs_of(task, labels), metric) for title, labels in cells.CURVES.items()},
+            {title: curve_of(runs_of(task, labels), metric) for title, labels in layout.CURVES.items()},
             levels(task, env, metric),
         )
         for env, task in tasks.items()
@@ -103,13 +102,13 @@ def figure_4_3(tasks: Tasks, folder: Path) -> str:
     is_drawn = figures.draw_curves(panels, file(folder, "4.3"))
     said = "Horizontal lines are final values, the thesis's where it says so.\n"
     title = "Hypervolume and expected utility over steps"
-    return "\n".join([picture("4.3", title, is_drawn), said, notes(tasks, cells.CURVES)])
+    return "\n".join([picture("4.3", title, is_drawn), said, notes(tasks, layout.CURVES)])
 
 
 def levels(task: Task, env: str, metric: Metric) -> dict[str, float]:
     """The final IQM of the multi-policy methods, the thesis's where there are no runs."""
     found = {}
-    for title, labels in cells.LEVELS.items():
+    for title, labels in layout.LEVELS.items():
         ours = score_of(runs_of(task, labels), metric)
         published = read_thesis().tasks[env].scores[metric][title]
         found[title if ours else f"{title} (thesis)"] = (ours or published).value
@@ -122,23 +121,23 @@ def figure_4_4(tasks: Tasks, folder: Path) -> str:
         unit = main_units(tasks, metric)
         curves = {
             title: aggregate_curve(tasks, labels, metric, unit, FIRST_STEPS)
-            for title, labels in cells.SAMPLE_EFFICIENCY.items()
+            for title, labels in layout.SAMPLE_EFFICIENCY.items()
         }
         panels.append(CurvePanel("", f"normalised {short}", curves))
         text.append(unit_note(tasks, unit, "PGMORL", metric))
     is_drawn = figures.draw_curves(panels, file(folder, "4.4"))
     title = f"Normalised scores within the first {FIRST_STEPS:,} steps"
     said = "Each curve goes as far as all tasks of its method do.\n"
-    return "\n".join([picture("4.4", title, is_drawn), said, *text, notes(tasks, cells.SAMPLE_EFFICIENCY)])
+    return "\n".join([picture("4.4", title, is_drawn), said, *text, notes(tasks, layout.SAMPLE_EFFICIENCY)])
 
 
 def figure_4_5(tasks: Tasks, folder: Path) -> str:
     panels = []
     rows = [["task", "preferences", "of the thesis", "runs", "HV of their front", "Momba's median run", "its HV"]]
     for env, published in read_thesis().tasks.items():
-        task, of_thesis = tasks.get(env), cells.FIXED_PREFERENCES[len(published.objectives)]
+        task, of_thesis = tasks.get(env), layout.FIXED_PREFERENCES[len(published.objectives)]
         reference = fixed_values(task)
-        run = median_run(runs_of(task, cells.MOMBA))
+        run = median_run(runs_of(task, layout.MOMBA))
         ours = [MISSING] * 2 if run is None else [f"seed {run.record.seed}", f"{run.hypervolume:,.4g}"]
         if task is None or reference is None:
             rows.append([published.name, MISSING, str(of_thesis), MISSING, MISSING, *ours])
@@ -159,7 +158,7 @@ def figure_4_7(tasks: Tasks, folder: Path) -> str:
     unit = ablation_units(tasks)
     found = {
         group: {title: aggregate(tasks, labels, "hypervolume", unit) for title, labels in methods.items()}
-        for group, methods in cells.VALUES.items()
+        for group, methods in layout.VALUES.items()
     }
     rows = [["configuration", "values", "runs", "tasks", NORMALISED_HV]]
     rows += [[group, title, *aggregate_cells(one)] for group, members in found.items() for title, one in members.items()]
@@ -169,7 +168,7 @@ def figure_4_7(tasks: Tasks, folder: Path) -> str:
             picture("4.7", "Vector and scalarised values", is_drawn),
             markdown(rows),
             unit_note(tasks, unit, "Momba", "hypervolume"),
-            notes(tasks, joined(cells.VALUES)),
+            notes(tasks, joined(layout.VALUES)),
         ]
     )
 
@@ -182,7 +181,7 @@ def figure_4_8(tasks: Tasks, folder: Path) -> str:
     unit = ablation_units(tasks)
     rows = [["configuration", "critic's hidden dimension", "critic parameters", "runs", "tasks", NORMALISED_HV]]
     lines = {}
-    for group, methods in cells.SCALING.items():
+    for group, methods in layout.SCALING.items():
         points = []
         for width, labels in methods.items():
             one, size = aggregate(tasks, labels, "hypervolume", unit), critic_parameters(tasks, labels)
@@ -196,15 +195,15 @@ def figure_4_8(tasks: Tasks, folder: Path) -> str:
             picture("4.8", "Hypervolume over the critic's size", is_drawn),
             markdown(rows),
             unit_note(tasks, unit, "Momba", "hypervolume"),
-            notes(tasks, joined(cells.SCALING)),
+            notes(tasks, joined(layout.SCALING)),
         ]
     )
 
 
 def figure_4_9(tasks: Tasks, folder: Path) -> str:
     unit = ablation_units(tasks)
-    found = {title: aggregate(tasks, labels, "hypervolume", unit) for title, labels in cells.NORMALISATION.items()}
-    worth, common = normalisation_worth(tasks, cells.NORMALISATION)
+    found = {title: aggregate(tasks, labels, "hypervolume", unit) for title, labels in layout.NORMALISATION.items()}
+    worth, common = normalisation_worth(tasks, layout.NORMALISATION)
     values = shapley_values(worth) if worth else {}
     is_drawn = figures.draw_normalisation(found, values, NORMALISED_HV, file(folder, "4.9"))
     parts = [picture("4.9", "Normalisation components and their Shapley values", is_drawn)]
@@ -216,12 +215,12 @@ def figure_4_9(tasks: Tasks, folder: Path) -> str:
         parts += [f"Shapley values of the IQM of the normalised hypervolume, over {names(common)}.\n", markdown(rows)]
     else:
         parts.append("Shapley values: missing, no task has runs of all eight combinations.\n")
-    return "\n".join([*parts, unit_note(tasks, unit, "Momba", "hypervolume"), notes(tasks, cells.NORMALISATION)])
+    return "\n".join([*parts, unit_note(tasks, unit, "Momba", "hypervolume"), notes(tasks, layout.NORMALISATION)])
 
 
 def table_4_4(tasks: Tasks, folder: Path) -> str:
     note = unit_note(tasks, ablation_units(tasks), "Momba", "hypervolume")
-    return "\n".join([tables.table_4_4(tasks), note, notes(tasks, cells.CONDITIONING)])
+    return "\n".join([tables.table_4_4(tasks), note, notes(tasks, layout.CONDITIONING)])
 
 
 def figure_4_10(tasks: Tasks, folder: Path) -> str:
@@ -229,12 +228,12 @@ def figure_4_10(tasks: Tasks, folder: Path) -> str:
         CurvePanel(
             read_thesis().tasks[env].name,
             SHORT["hypervolume"],
-            {title: curve_of(runs_of(task, labels), "hypervolume") for title, labels in cells.UTD.items()},
+            {title: curve_of(runs_of(task, labels), "hypervolume") for title, labels in layout.UTD.items()},
         )
         for env, task in tasks.items()
     ]
     is_drawn = figures.draw_curves(panels, file(folder, "4.10"))
-    return "\n".join([picture("4.10", "Hypervolume over steps for each UTD ratio", is_drawn), notes(tasks, cells.UTD)])
+    return "\n".join([picture("4.10", "Hypervolume over steps for each UTD ratio", is_drawn), notes(tasks, layout.UTD)])
 
 
 def table_4_5(tasks: Tasks, folder: Path) -> str:
@@ -243,11 +242,11 @@ def table_4_5(tasks: Tasks, folder: Path) -> str:
         "which that envelope goes from 0 to 1: it changes with the records.\n"
     )
     note = unit_note(tasks, ablation_units(tasks), "Momba", "hypervolume")
-    return "\n".join([tables.table_4_5(tasks), said, note, notes(tasks, cells.IMPROVEMENTS)])
+    return "\n".join([tables.table_4_5(tasks), said, note, notes(tasks, layout.IMPROVEMENTS)])
 
 
 def figure_4_11(tasks: Tasks, folder: Path) -> str:
-    return fronts(tasks, folder, "4.11", "Fronts with HER and PAR", cells.IMPROVEMENTS)
+    return fronts(tasks, folder, "4.11", "Fronts with HER and PAR", layout.IMPROVEMENTS)
 
 
 SECTIONS = {

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sb3_momba.benchmark.chapter4.cells import CONDITIONING, IMPROVEMENTS, MAIN, Labels, Methods
 from sb3_momba.benchmark.chapter4.differences import MISSING, all_runs, names, range_text, steps_of
+from sb3_momba.benchmark.chapter4.layout import CONDITIONING, IMPROVEMENTS, MAIN, Labels, Methods
 from sb3_momba.benchmark.chapter4.scores import (
     Aggregate,
     Tasks,
@@ -16,8 +16,7 @@ from sb3_momba.benchmark.chapter4.scores import (
     score_of,
 )
 from sb3_momba.benchmark.chapter4.thesis import read_thesis, scaled
-from sb3_momba.benchmark.report import median_run
-from sb3_momba.benchmark.results import Metric, Run
+from sb3_momba.benchmark.results import Metric, Run, median_run, parameters_of
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text, markdown
 
@@ -41,8 +40,8 @@ def summary(tasks: Tasks, labels: Labels) -> list[str]:
     runs = all_runs(tasks, labels)
     if not runs:
         return [MISSING] * 3
-    first = [runs_of(task, labels)[0] for task in tasks.values() if runs_of(task, labels)]
-    parameters = [sum(run.record.parameters.values()) for run in first if run.record.parameters]
+    sizes = [parameters_of(runs_of(task, labels)) for task in tasks.values()]
+    parameters = [sum(one.values()) for one in sizes if one]
     policies = [n for n in map(n_policies, runs) if n is not None]
     steps = [steps_of(run) for run in runs]
     return [

@@ -11,11 +11,13 @@ import yaml
 
 from sb3_momba import train
 from sb3_momba.baselines.settings import VARIANTS
-from sb3_momba.benchmark import cells
-from sb3_momba.benchmark.cells import Cell, as_arguments, cells_of, make_cells, merged, read_grid, shipped_grids
+from sb3_momba.benchmark import grid
+from sb3_momba.benchmark.grid import Cell, as_arguments, cells_of, make_cells, merged, read_grid, shipped_grids
 from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.envs.preferences import preference_grid
+from sb3_momba.files import FileFormatError, FolderInUseError, alone_in
 from sb3_momba.zoo.configuration import read_configuration, with_defaults
+from tests.test_benchmark import write_record
 
 MINE = {"variants": ["momba", "capql"], "tasks": ["MO-Hopper-v4", "MO-Ant-v4"], "seeds": 2}
 NOTHING = {"grid": [], "conf": [], "env": [], "seeds": None, "auto_ent_coef": None}
@@ -38,8 +40,8 @@ def test_a_grid_is_every_variant_on_every_task_with_every_seed(tmp_path) -> None
 
 
 def test_the_command_line_wins_over_a_grid(tmp_path) -> None:
-    grid = written(tmp_path, options={"steps": 500, "n_episodes": 2}, auto_ent_coef=0.05)
-    found = asked_for("--steps", "300", grid=[grid], env=["MO-Swimmer-v4"], seeds=1, auto_ent_coef=0.01)
+    path = written(tmp_path, options={"steps": 500, "n_episodes": 2}, auto_ent_coef=0.05)
+    found = asked_for("--steps", "300", grid=[path], env=["MO-Swimmer-v4"], seeds=1, auto_ent_coef=0.01)
     assert [cell.name for cell in found] == ["momba/MO-Swimmer-v4/0", "capql/MO-Swimmer-v4/0"]
     settings = train.parse(found[0].arguments(tmp_path))
     assert (settings.steps, settings.n_episodes, settings.hyperparameters["ent_coef"]) == (300, 2, "auto_0.01")
@@ -70,8 +72,8 @@ def test_grids_that_ask_for_one_run_in_two_ways_are_refused(tmp_path) -> None:
 
 
 def test_runs_for_one_preference_each(tmp_path) -> None:
-    grid = {"tasks": ["MO-Hopper-v4", "MO-Hopper-3obj-v4"], "variants": ["momba"], "seeds": 1}
-    found = asked_for(grid=[written(tmp_path, **grid, fixed_preferences={2: 4, 3: 6})])
+    entries = {"tasks": ["MO-Hopper-v4", "MO-Hopper-3obj-v4"], "variants": ["momba"], "seeds": 1}
+    found = asked_for(grid=[written(tmp_path, **entries, fixed_preferences={2: 4, 3: 6})])
     assert [cell.name for cell in found[:4]] == [f"fixed_preference-0{n}/MO-Hopper-v4/0" for n in range(4)]
     assert len(found) == 4 + 6
     settings = [train.parse(cell.arguments(tmp_path)) for cell in found]
@@ -81,18 +83,26 @@ def test_runs_for_one_preference_each(tmp_path) -> None:
 
 
 def test_a_number_of_objectives_without_preferences_is_an_error(tmp_path) -> None:
-    grid = written(tmp_path, tasks=["MO-Hopper-3obj-v4"], fixed_preferences={2: 20})
+    path = written(tmp_path, tasks=["MO-Hopper-3obj-v4"], fixed_preferences={2: 20})
     with pytest.raises(ValueError, match=r"fixed_preferences=\{2: 20\}: MO-Hopper-3obj-v4 has 3 objectives"):
-        asked_for(grid=[grid])
+        asked_for(grid=[path])
 
 
 BAD = {
     "an entry that there is not": ({"task": []}, "A grid has no entry 'task': did you mean 'tasks'"),
-    "seeds that are no number": ({"seeds": "ten"}, "seeds is 'ten'; it must be a int"),
+    "seeds that are no number": ({"seeds": "ten"}, "seeds is 'ten'; it must be a whole number"),
+    "no variants": ({"variants": []}, "variants is []; it must be a list of names"),
+    "a variant that is no name": ({"variants": ["momba", 5]}, "variants is ['momba', 5]; it must be a list of names"),
+    "a task that is no name": ({"tasks": [None]}, "tasks is [None]; it must be a list of names"),
+    "preferences that are no number": ({"fixed_preferences": {2: "a"}}, "it must be a mapping of whole numbers"),
+    "an option without a value": ({"options": {"steps": None}}, "it must be a mapping of options with their values"),
+    "an option that is no name": ({"options": {5: 3}}, "it must be a mapping of options with their values"),
+    "an environment among the options": ({"options": {"env": "MO-Ant-v4"}}, "none of seed, output, env"),
+    "a start of alpha that is no number": ({"auto_ent_coef": "low"}, "auto_ent_coef is 'low'; it must be a number"),
     "no seeds": ({"seeds": 0}, "seeds=0: at least one"),
-    "variants that are no list": ({"variants": "momba"}, "variants is 'momba'; it must be a list"),
+    "variants that are no list": ({"variants": "momba"}, "variants is 'momba'; it must be a list of names"),
     "options that are no mapping": ({"options": ["--steps"]}, "options is"),
-    "an option that is the grid's own": ({"options": {"seed": 3}}, "--seed is the grid's own"),
+    "an option that is the grid's own": ({"options": {"seed": 3}}, "none of seed, output, env"),
     "a variant that there is not": ({"variants": ["mombo"]}, "did you mean 'momba'"),
 }
 
@@ -131,16 +141,45 @@ def test_no_cells_are_no_cells() -> None:
 
 
 def test_baselines_are_variants_like_others(tmp_path) -> None:
-    grid = written(tmp_path, variants=["momba", "gpi_ls_utd_1"], tasks=["MO-Hopper-v4"], seeds=1, auto_ent_coef=0.01)
-    ours, theirs = asked_for("--steps", "1e4", grid=[grid])
+    path = written(tmp_path, variants=["momba", "gpi_ls_utd_1"], tasks=["MO-Hopper-v4"], seeds=1, auto_ent_coef=0.01)
+    ours, theirs = asked_for("--steps", "1e4", grid=[path])
     assert theirs.name == "gpi_ls_utd_1/MO-Hopper-v4/0"
-    settings = cells.checked([ours, theirs], tmp_path)[theirs.name]
+    settings = grid.checked([ours, theirs], tmp_path)[theirs.name]
     assert (settings.algorithm, settings.label, settings.steps) == ("gpi_ls", "gpi_ls_utd_1", 10_000)
     assert settings.hyperparameters == {"gradient_updates": 1}
-    assert cells.has_to_run(theirs, settings)
+    assert grid.has_to_run(theirs, settings)
     theirs.program.runs.record_failure(settings, "it did not start")
-    assert not cells.has_to_run(theirs, settings)
-    assert list(cells.failed([theirs], tmp_path)) == [theirs.name]
+    assert not grid.has_to_run(theirs, settings)
+    assert list(grid.failed([theirs], tmp_path)) == [theirs.name]
+
+
+def test_what_an_option_makes_alike_is_not_trained_twice(tmp_path) -> None:
+    alike = asked_for(grid=["alpha_start"], env=["MO-Hopper-v4"], seeds=1, auto_ent_coef=0.01)
+    with pytest.raises(ValueError, match="alpha_start_5e-2/MO-Hopper-v4/0 have the same settings: leave one of"):
+        grid.checked(alike, tmp_path)
+    grid.checked(asked_for(grid=["alpha_start"], env=["MO-Hopper-v4"], seeds=1), tmp_path)
+
+
+def test_a_folder_is_emptied_by_one_process_only(tmp_path, monkeypatch) -> None:
+    """A training that goes on after its grid was killed keeps its folder."""
+    monkeypatch.setattr(grid, "SECONDS_FOR_A_LOCK", 0.1)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "model.zip").write_text("mine")
+    with alone_in(tmp_path / "run"), pytest.raises(FolderInUseError):
+        grid.way_to_run(tmp_path / "run")
+    assert (tmp_path / "run" / "model.zip").exists()
+    assert grid.way_to_run(tmp_path / "run") == "begin"
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
+
+
+def test_checkpoints_that_cannot_be_read_are_not_thrown_away(tmp_path) -> None:
+    write_record(tmp_path / "run" / "record.jsonl", error="cut off")
+    checkpoint = tmp_path / "run" / "checkpoints" / "0001-000000100"
+    checkpoint.mkdir(parents=True)
+    (checkpoint / "manifest.json").write_text("{}")
+    with pytest.raises(FileFormatError):
+        grid.way_to_run(tmp_path / "run")
+    assert checkpoint.exists()
 
 
 # ------------------------------------------------------------------------------------------------------- shipped grids
@@ -184,4 +223,4 @@ def test_grids_are_named_in_the_help(capsys) -> None:
     with pytest.raises(SystemExit):
         main(["run", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert all(name in said.replace("- ", "-") for name in cells.shipped_grids())
+    assert all(name in said.replace("- ", "-") for name in grid.shipped_grids())

@@ -1,0 +1,79 @@
+"""A grid of runs on this machine, each in a process of its own.
+
+A cell whose run ended, well or badly, is not run again; one that was cut off is. So the same command goes on where it stopped.
+"""
+
+import argparse
+import logging
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from sb3_momba.benchmark import grid
+from sb3_momba.benchmark.grid import Cell
+from sb3_momba.files import FileFormatError, FolderInUseError
+
+INTERRUPTED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
+
+logger = logging.getLogger(__name__)
+
+
+def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_failed: bool = False) -> dict[str, str]:
+    """Run what has not ended yet: see `grid.run_cells`.
+
+    :param processes: runs side by side
+    """
+    if processes < 1:
+        raise ValueError(f"processes={processes}: at least one is needed.")
+
+    def side_by_side(waiting: Sequence[Cell], settings: Mapping[str, Any]) -> dict[str, str]:
+        with ThreadPoolExecutor(processes) as pool:
+            try:
+                said = list(pool.map(lambda cell: _run_cell(cell, settings[cell.name], retry_failed), waiting))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return {cell.name: error for cell, error in zip(waiting, said, strict=True) if error is not None}
+
+    return grid.run_cells(cells, output, side_by_side, retry_failed)
+
+
+def _run_cell(cell: Cell, settings: Any, retry_failed: bool) -> str | None:
+    """What kept it from running, if anything did."""
+    logger.info("%s starts", cell.name)
+    folder = Path(settings.output)
+    try:
+        way = grid.way_to_run(folder, retry_failed)
+    except (FolderInUseError, FileFormatError, OSError) as error:
+        logger.info("%s is left alone: %s", cell.name, error)
+        return str(error)
+    if way is not None:
+        arguments = ["--resume", str(folder), "--no-progress-bar"] if way == "go on" else cell.arguments(folder)
+        command = [sys.executable, "-m", cell.program.module, *arguments]
+        with open(grid.log_of(folder), "ab" if way == "go on" else "wb") as log:
+            # Runs side by side share the cores: one thread each.
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            ended = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
+        if grid.state_of(folder) == "not begun" and ended.returncode > 0 and ended.returncode not in INTERRUPTED:
+            said = grid.log_of(folder).read_text(errors="replace").rstrip()
+            last = said.splitlines()[-1] if said else "no output"
+            cell.program.runs.record_failure(settings, f"it did not start: {last}", said)
+    state = grid.state_of(folder)
+    logger.info("%s %s", cell.name, state if state != "not begun" else "did not begin")
+    return None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    grid.add_arguments(parser)
+    parser.add_argument("--processes", type=int, default=2, help="runs side by side, one thread each")
+
+
+def main(given: argparse.Namespace, options: Sequence[str]) -> None:
+    logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
+    failures = run_grid(grid.cells_of(given, options), given.output, given.processes, given.retry_failed)
+    grid.end_with_failures(failures, given.output)
