@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence reduced rounding speed torture compat clean
+.PHONY: demo test browser lint known-fronts first-records evidence reduced rounding speed torture compat docs linkcheck clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -64,6 +64,16 @@ compat: $(VENV)/tools
 speed: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark speed --threads 1
 
+# Warnings are errors.
+SPHINX := $(BIN)/python -m sphinx -W --keep-going -n
+
+docs: $(VENV)/tools
+	$(SPHINX) -b html docs docs/_build/html
+
+# Asks the network whether links to elsewhere still lead somewhere.
+linkcheck: $(VENV)/tools
+	$(SPHINX) -b linkcheck docs docs/_build/linkcheck
+
 $(VENV)/installed: setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip setuptools
@@ -75,4 +85,4 @@ $(VENV)/tools: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache

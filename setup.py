@@ -47,12 +47,13 @@ setup(
     extras_require={
         "baselines": ["morl-baselines>=1.3"],
         "benchmark": ["ray[tune]>=2.40"],  # sweeps; grids on one machine need nothing
+        "docs": ["sphinx>=8", "myst-parser>=4", "furo>=2024.8"],
         "explorer": ["plotly>=6", "imageio-ffmpeg>=0.5"],
         "export": ["onnx>=1.16"],  # .onnx files; TorchScript needs nothing
         "hub": ["huggingface_hub>=0.30"],
         "zoo": ["rl_zoo3>=2.9,<3", "seaborn>=0.13", "pandas>=2.2,<3"],  # the last two for its plots
         "test": [
-            "sb3-momba[baselines,benchmark,explorer,export,hub,zoo]",
+            "sb3-momba[baselines,benchmark,docs,explorer,export,hub,zoo]",
             "onnxruntime>=1.18",
             "playwright>=1.45",  # drives the system's Chromium
             "wandb>=0.19",

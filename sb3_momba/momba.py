@@ -60,7 +60,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
     :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
-    :param target_entropy: of the policy on [-1, 1], in nats; "auto": -|A|
+    :param target_entropy: of the policy on [-1, 1], in nats; "auto": `-|A|`
     :param preference_sampler: `rng -> (n_objectives,)` for all environments, or a literal as `make_sampler` takes it; None
         leaves them theirs, by default uniform on the simplex once an episode
     :param precision: of an update's products: "float32", "bfloat16", or "auto", bfloat16 if the device has instructions for it
