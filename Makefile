@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence reduced rounding speed torture compat docs linkcheck clean
+.PHONY: demo test browser lint known-fronts first-records evidence reduced rounding sweep-throughput speed torture compat docs linkcheck clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -60,6 +60,9 @@ torture: $(VENV)/tools
 # Stable-Baselines3's own tests with MOMBA in SAC's place.
 compat: $(VENV)/tools
 	$(ONE_THREAD) $(BIN)/python -m tests.compat
+
+sweep-throughput: $(VENV)/tools
+	$(BIN)/python -m tests.sweep_throughput
 
 speed: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark speed --threads 1
