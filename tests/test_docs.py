@@ -25,7 +25,7 @@ from torch import nn
 
 import sb3_momba
 from sb3_momba import MOMBA, train
-from sb3_momba.benchmark import cells
+from sb3_momba.benchmark import grid
 from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 from sb3_momba.settings import policy_parameters
@@ -183,7 +183,7 @@ def test_yaml_of_the_pages_is_taken(page: Path, tmp_path: Path) -> None:
         file = tmp_path / f"{number}.yml"
         file.write_text(block)
         if "variants:" in block:
-            assert cells.read_grid(str(file)).seeds > 0
+            assert grid.read_grid(str(file)).seeds > 0
         else:
             train.parse(["--env", "mo-hopper-2obj-v5", "--conf", str(file)])
 

@@ -12,7 +12,7 @@ import pytest
 
 from sb3_momba import train
 from sb3_momba.benchmark import __main__ as benchmark
-from sb3_momba.benchmark import cells, grid, sweep
+from sb3_momba.benchmark import grid, local, sweep
 from sb3_momba.zoo import __main__ as zoo
 from tests.pages import BLOCK, PAGES, ROOT, commands, every_page
 
@@ -28,9 +28,9 @@ def parse_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def stop(*_: Any, **__: Any) -> None:
         raise UnderstoodError
 
-    def check_cells(asked_for: list[cells.Cell], output: Path, *_: Any) -> None:
+    def check_cells(asked_for: list[grid.Cell], output: Path, *_: Any) -> None:
         for cell in asked_for[:: max(1, len(asked_for) // 3)]:
-            train.parse(cell.arguments(output))
+            cell.program.parse(cell.arguments(output / cell.name))
         raise UnderstoodError
 
     def after_parsing(script: Any, command: str, arguments: list[str]) -> None:
@@ -44,10 +44,10 @@ def parse_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "logs" / "momba").mkdir(parents=True)
     for env in ("mo-hopper-2obj-v5", "MO-Hopper-v4"):
         (tmp_path / "logs" / "momba" / f"{env}_1").mkdir()
-    monkeypatch.setattr(grid, "run_grid", check_cells)
+    monkeypatch.setattr(local, "run_grid", check_cells)
     monkeypatch.setattr(sweep, "run_sweep", check_cells)
     for module, _ in benchmark.COMMANDS.values():
-        if module not in (grid, sweep):
+        if module not in (local, sweep):
             monkeypatch.setattr(module, "main", stop)
     monkeypatch.setattr(zoo, "call", after_parsing)
 
