@@ -92,11 +92,14 @@ def _learning_curve(runs: Sequence[Run], reference_point: Array, metric: str) ->
     return {"data": data, "layout": {**layout, "showlegend": False}}
 
 
-def front(runs: Sequence[Run], objectives: Sequence[str]) -> Chart:
-    """All runs' newest fronts: as points of two or three objectives, or as a line for each policy."""
+def front(runs: Sequence[Run], objectives: Sequence[str], quantity: str = "return") -> Chart:
+    """All runs' newest fronts: as points of two or three objectives, or as a line for each policy.
+
+    :param quantity: what the axes show
+    """
     ranges = ranges_of([run.values for run in runs])
     data = [trace for i, run in enumerate(runs) for trace in _front_traces(run, i, run.values, ranges, _texts(run, objectives))]
-    return {"data": data, "layout": _front_layout(objectives, ranges, len(runs))}
+    return {"data": data, "layout": _front_layout(objectives, ranges, len(runs), quantity)}
 
 
 def growth(runs: Sequence[Run], objectives: Sequence[str]) -> tuple[Chart, list[Chart]]:
@@ -252,14 +255,14 @@ def selection(n_objectives: int) -> Chart:
     }
 
 
-def _front_layout(objectives: Sequence[str], ranges: Array, n_runs: int) -> Chart:
+def _front_layout(objectives: Sequence[str], ranges: Array, n_runs: int, quantity: str = "return") -> Chart:
     n = len(objectives)
     legend = {"showlegend": n_runs > 1, "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}}
     low, high = ranges
     margin = np.where(high > low, 0.06 * (high - low), np.maximum(np.abs(high) * 0.05, 1e-3))
     limits = np.stack([low - margin, high + margin], axis=1).tolist()
     if n in (2, 3):
-        axes = [_axis(f"{as_label(name)} (return)", range=limits[k]) for k, name in enumerate(objectives)]
+        axes = [_axis(f"{as_label(name)} ({quantity})", range=limits[k]) for k, name in enumerate(objectives)]
         if n == 2:
             return {**_layout(*axes), **legend}
         scene = {

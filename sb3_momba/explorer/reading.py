@@ -1,6 +1,7 @@
 """What lies in the folder of a run, finished or not, as a report needs it."""
 
 import contextlib
+import json
 import logging
 from collections import Counter
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ class Run:
 
     :param name: its own among the report's runs
     :param values: mean return of each point of its newest front, (n, n_objectives)
-    :param front: the same with the return of every episode; None where front.npz is missing or of another evaluation
+    :param front: the same with the return of every episode, from the record or else from front.npz; None where neither has it
     :param model: the file of a model; None where there is none
     :param films: under the points' numbers
     :param no_films: why there are none
@@ -126,7 +127,8 @@ def read_run(folder: Path) -> Run:
         raise ValueError(f"{folder} holds a run without an evaluation ({why}): there is nothing to report yet.")
     values = record.final_values if record.final_values is not None else record.evaluations[-1].values
     model = next((folder / name for name in models_of(record) if (folder / name).is_file()), None)
-    run = Run(f"{record.label}, seed {record.seed}", record, values, _front(folder, values), model)
+    front = final_front(record) or _front(folder, values)
+    run = Run(f"{record.label}, seed {record.seed}", record, values, front, model)
     if model is None:
         run.no_films = "The run's folder has no model (model.zip or best_model.zip)."
     if not record.general_policy:
@@ -137,6 +139,28 @@ def read_run(folder: Path) -> Run:
 def models_of(record: Record) -> tuple[str, str]:
     """Which model to show: of a finished run the last one, whose front it is; of others the best one that was evaluated."""
     return ("model.zip", "best_model.zip") if record.error is None else ("best_model.zip", "model.zip")
+
+
+def final_front(record: Record) -> ParetoFront | None:
+    """The front with which the record of a finished run ends; None where it does not, or has no discounted returns.
+
+    :raises FileFormatError: if it is damaged
+    """
+    if record.error is not None:
+        return None
+    front = json.loads(record.path.read_bytes().splitlines()[-1])["front"]
+    if "discounted_returns" not in front:
+        return None
+    try:
+        preferences, returns, discounted = (
+            np.asarray(front[name], dtype=np.float64) for name in ("preferences", "returns", "discounted_returns")
+        )
+        lengths = np.asarray(front["episode_lengths"], dtype=np.int64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{record.path}: its final front is damaged: {type(error).__name__}: {error}.") from error
+    if discounted.shape != returns.shape or lengths.shape != returns.shape[:2] or preferences.shape != returns.shape[::2]:
+        raise FileFormatError(f"{record.path}: its final front has arrays that do not go together.")
+    return ParetoFront(preferences, returns, discounted, lengths, dict(front.get("settings", {})))
 
 
 def _front(folder: Path, values: Array) -> ParetoFront | None:

@@ -129,7 +129,7 @@ def record_episode(
 
     :param number: of the episode among all those of the evaluation that it shall equal; see `evaluate_front`
     """
-    model = _load(policy.path)
+    model = load_model(policy.path)
     recorders: list[Recorder] = []
 
     def recorded() -> gym.Env:
@@ -232,13 +232,13 @@ def encode(pictures: Sequence[Image]) -> bytes:
         return Path(path).read_bytes()
 
 
-def _load(path: Path) -> MOMBA:
+def load_model(path: Path) -> MOMBA:
+    """A model on the processor, read again only when its file has changed."""
     return _load_version(path, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
 def _load_version(path: Path, _written: int) -> MOMBA:
-    """Once for all films of a model, and again when its file has changed."""
     return MOMBA.load(path, device="cpu")
 
 
@@ -278,11 +278,13 @@ class RenderingProcess:
     def call(self, function: Callable[..., Result], *arguments: Any) -> Result:
         """`function(*arguments)` in the process.
 
-        :raises RenderingError: if it crashes; an error that is raised comes out as it is
+        :raises RenderingError: if it crashes, which the next call does not feel; an error that is raised comes out as it is
         """
         try:
             return self.pool.submit(function, *arguments).result()
         except BrokenProcessPool as error:
+            self.pool.shutdown()
+            self.pool = self._start()
             raise RenderingError("the process that draws crashed") from error
 
     def __enter__(self) -> "RenderingProcess":
@@ -315,7 +317,7 @@ def check_filmable(policy: Policy) -> bool:
     """
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise RenderingError("the package imageio-ffmpeg is missing, which writes films: `pip install 'sb3-momba[explorer]'`.")
-    check_model_fits(_load(policy.path), probe_environment(policy.env, policy.env_kwargs))
+    check_model_fits(load_model(policy.path), probe_environment(policy.env, policy.env_kwargs))
     env = _filmed_env(policy)
     env.close()
     return is_mujoco(env)

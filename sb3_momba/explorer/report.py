@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_momba import __version__
 from sb3_momba.explorer import charts
 from sb3_momba.explorer.reading import Run, measure, objectives_of, read_runs
-from sb3_momba.explorer.rendering import FPS, RenderingProcess, check_filmable, film
+from sb3_momba.explorer.rendering import FPS, Film, RenderingProcess, check_filmable, film
 from sb3_momba.explorer.stage import RenderingError
 from sb3_momba.files import atomic_write
 
@@ -134,7 +134,7 @@ def to_html(runs: Sequence[Run], reference_point: Array, plotly: str) -> str:
         "states": states,
         "runs": [run_numbers(run, i) for i, run in enumerate(runs)],
     }
-    script, css = page_file("page.js"), page_file("page.css")
+    script, css = page_file("common.js") + page_file("page.js"), page_file("page.css")
     plotly = plotly.replace("\r", "")
     named = ", ".join(objectives[:-1]) + f" and {objectives[-1]}" if len(objectives) > 1 else objectives[0]
     some = f"{len(runs)} runs under" if len(runs) > 1 else "One run under"
@@ -162,17 +162,7 @@ def to_html(runs: Sequence[Run], reference_point: Array, plotly: str) -> str:
 
 def run_numbers(run: Run, i: int) -> dict[str, Any]:
     """What the page's script needs of a run."""
-    films = [
-        {
-            "point": k,
-            "video": base64.b64encode(one.video).decode(),
-            "returns": [[float(f"{x:.6g}") for x in frame] for frame in one.returns],
-            "total": one.total.tolist(),
-            "steps": one.steps,
-            "speed": one.speed,
-        }
-        for k, one in run.films.items()
-    ]
+    films = [{"point": k, **film_numbers(one)} for k, one in run.films.items()]
     return {
         "name": run.name,
         "colour": charts.colour_of(i),
@@ -184,6 +174,17 @@ def run_numbers(run: Run, i: int) -> dict[str, Any]:
         "n_episodes": run.n_episodes,
         "films": films,
         "no_films": run.no_films,
+    }
+
+
+def film_numbers(film: Film) -> dict[str, Any]:
+    """What a page's script needs of a film."""
+    return {
+        "video": base64.b64encode(film.video).decode(),
+        "returns": [[float(f"{x:.6g}") for x in frame] for frame in film.returns],
+        "total": film.total.tolist(),
+        "steps": film.steps,
+        "speed": film.speed,
     }
 
 

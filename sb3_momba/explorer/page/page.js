@@ -1,35 +1,12 @@
-"use strict";
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
+  const { coordinates, element, number, scale, showFrame, sparkline, urlOf } = explorer;
   const at = (id) => document.getElementById(id);
   const { runs, objectives } = report;
-  const isLine = objectives.length !== 2 && objectives.length !== 3;
   const stillness = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
   const config = { responsive: true, displaylogo: false, displayModeBar: false };
   const selected = { run: 0, point: 0 };
   let film = null;
-
-  // As charts.number writes them.
-  function number(x) {
-    for (const [size, unit] of [[1e12, ""], [1e9, " G"], [1e6, " M"]]) {
-      if (Math.abs(x) >= size) return size === 1e12 ? x.toExponential(3) : `${Number((x / size).toPrecision(4))}${unit}`;
-    }
-    if (Math.abs(x) >= 1000) return Math.round(x).toLocaleString("en");
-    return x === 0 || Math.abs(x) >= 1e-3 ? String(Number(x.toPrecision(4))) : x.toExponential(1);
-  }
-
-  function element(tag, text, attributes = {}) {
-    const made = document.createElement(tag);
-    if (text !== undefined) made.textContent = text;
-    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-    return made;
-  }
-
-  function svg(tag, attributes) {
-    const made = document.createElementNS("http://www.w3.org/2000/svg", tag);
-    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-    return made;
-  }
 
   const weights = (run, point) =>
     run.preferences === null ? `solution ${point + 1}` : run.preferences[point].map((w) => w.toFixed(2)).join(" / ");
@@ -49,17 +26,9 @@
     return distances.indexOf(Math.min(...distances));
   }
 
-  function coordinates(run, point) {
-    const values = run.values[point];
-    if (!isLine) return Object.fromEntries(values.map((v, i) => ["xyz"[i], [[v]]]));
-    const [low, high] = report.ranges;
-    const heights = values.map((v, i) => (high[i] > low[i] ? (v - low[i]) / (high[i] - low[i]) : 0.5));
-    return { x: [values.map((_, i) => i)], y: [heights] };
-  }
-
   function mark() {
     const run = runs[selected.run];
-    Plotly.restyle("front", coordinates(run, selected.point), [report.charts.front.data.length - 1]);
+    Plotly.restyle("front", coordinates(run.values[selected.point], report.ranges), [report.charts.front.data.length - 1]);
     const regret = report.charts.regret;
     if (!regret) return;
     const last = regret.data.length - 1;
@@ -67,14 +36,6 @@
       trace.customdata.map((id, i) => [id, trace.x[i], trace.y[i]]));
     const one = found.find(([id]) => id[0] === selected.run && id[1] === selected.point);
     Plotly.restyle("regret", one ? { x: [[one[1]]], y: [[one[2]]] } : { x: [[]], y: [[]] }, [last]);
-  }
-
-  function urlOf(one) {
-    if (!one.url) {
-      const bytes = Uint8Array.from(atob(one.video), (character) => character.charCodeAt(0));
-      one.url = URL.createObjectURL(new Blob([bytes], { type: "video/mp4" }));
-    }
-    return one.url;
   }
 
   function showFilm() {
@@ -108,7 +69,11 @@
       const row = element("tr");
       row.append(element("th", name, { scope: "row" }));
       const cell = element("td", undefined, { class: "spark" });
-      if (film !== null) cell.append(sparkline(run, i));
+      if (film !== null) {
+        const height = scale(run.films.flatMap((one) => one.returns.map((r) => r[i])));
+        const longest = Math.max(...run.films.map((one) => one.returns.length)) - 1 || 1;
+        cell.append(sparkline(film.returns, i, height, longest, run.colour));
+      }
       row.append(cell);
       if (film !== null) {
         row.append(element("td", "0", { class: "now", id: `now-${i}` }), element("td", number(film.total[i])));
@@ -125,39 +90,8 @@
     tick();
   }
 
-  function scaleOf(run, i) {
-    const every = run.films.flatMap((one) => one.returns.map((r) => r[i]));
-    const low = every.reduce((a, b) => Math.min(a, b), 0);
-    const high = every.reduce((a, b) => Math.max(a, b), 0);
-    return (x) => 30 - (28 * (x - low)) / (high > low ? high - low : 1);
-  }
-
-  function sparkline(run, i) {
-    const height = scaleOf(run, i);
-    const longest = Math.max(...run.films.map((one) => one.returns.length)) - 1 || 1;
-    const points = film.returns.map((r, k) => `${(100 * k) / longest},${height(r[i]).toFixed(2)}`).join(" ");
-    const picture = svg("svg", { viewBox: "0 0 100 32", preserveAspectRatio: "none", "aria-hidden": "true" });
-    picture.append(
-      svg("line", { x1: 0, x2: 100, y1: height(0), y2: height(0), stroke: "#d9dee3", "vector-effect": "non-scaling-stroke" }),
-      svg("polyline", { points, fill: "none", stroke: run.colour, "stroke-width": 1.5, "vector-effect": "non-scaling-stroke" }),
-      svg("line", { id: `cursor-${i}`, y1: 0, y2: 32, stroke: "#1f2933", "vector-effect": "non-scaling-stroke" }),
-    );
-    picture.dataset.longest = longest;
-    return picture;
-  }
-
-  // The numbers beside the film, in step with it.
   function tick() {
-    if (film === null) return;
-    const last = film.returns.length - 1;
-    const frame = Math.min(Math.floor(at("film").currentTime * report.fps + 1e-6), last);
-    film.returns[frame].forEach((value, i) => {
-      at(`now-${i}`).textContent = number(value);
-      const cursor = at(`cursor-${i}`);
-      const x = (100 * frame) / Number(cursor.parentNode.dataset.longest);
-      cursor.setAttribute("x1", x);
-      cursor.setAttribute("x2", x);
-    });
+    if (film !== null) showFrame(at("film"), report.fps, film.returns);
   }
 
   function everyFrame() {

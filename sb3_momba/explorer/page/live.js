@@ -1,0 +1,350 @@
+(() => {
+  const page = JSON.parse(document.getElementById("data").textContent);
+  const { coordinates, element, number, scale, showFrame, sparkline, urlOf } = explorer;
+  const at = (id) => document.getElementById(id);
+  const { objectives } = page;
+  const two = objectives.length === 2;
+  const stillness = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const config = { responsive: true, displaylogo: false, displayModeBar: false };
+  const SETTLED = 350; // ms without a move, after which the policy is rolled out
+  const STEPS = 100; // of a slider
+  const PREDICTED = page.front.data.length - 2;
+  const ROLLOUT = page.front.data.length - 1;
+  let preference = page.start;
+  let film = null;
+  let wish = 0; // counts the chosen preferences: answers to earlier ones are not shown
+  let settling = null;
+  let asking = false;
+  const said = { predicted: "", rollout: "" };
+
+  // Two decimals, as the sliders have them, or as many as a weight between needs.
+  const decimals = (w) => (w.every((x) => Math.abs(100 * x - Math.round(100 * x)) < 1e-3) ? 2 : 3);
+  const written = (w) => w.map((x) => x.toFixed(decimals(w))).join(" / ");
+  const described = (w) => w.map((x, i) => `${x.toFixed(decimals(w))} ${objectives[i]}`).join(", ");
+
+  async function ask(action, question) {
+    const request = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(question) };
+    let answer;
+    try {
+      answer = await fetch(action, request);
+    } catch {
+      throw new Error("The server does not answer: was it ended?");
+    }
+    const content = await answer.json();
+    if (!answer.ok) throw new Error(content.error);
+    if (content.superseded) throw Object.assign(new Error("Something newer was asked for."), { isOld: true });
+    return content;
+  }
+
+  function complain(error) {
+    if (error.isOld) return;
+    at("trouble").textContent = error.message;
+    at("trouble").hidden = false;
+  }
+
+  // ------------------------------------------------------------------------------------------------ preference
+
+  // One objective's weight is set, the others keep their proportions.
+  function withWeight(i, weight) {
+    const rest = preference.reduce((sum, x, k) => sum + (k === i ? 0 : x), 0);
+    const share = (x) => (rest > 1e-9 ? x / rest : 1 / (objectives.length - 1));
+    return preference.map((x, k) => (k === i ? weight : (1 - weight) * share(x)));
+  }
+
+  function makeSliders() {
+    const made = (two ? [objectives[0]] : objectives).map((name, i) => {
+      const box = element("div", undefined, { class: two ? "field slider" : "field slider row" });
+      const id = `weight-${i}`;
+      const slider = element("input", undefined, { type: "range", id, min: 0, max: STEPS, step: 1 });
+      slider.addEventListener("input", () => choose(withWeight(i, Number(slider.value) / STEPS)));
+      box.append(element("label", two ? "Preference" : name, { for: id }));
+      const output = element("output", undefined, { id: `weight-text-${i}`, for: id });
+      if (two) {
+        const ends = element("div", undefined, { class: "ends", "aria-hidden": "true" });
+        ends.append(element("span", `← ${objectives[1]}`), element("span", `${objectives[0]} →`));
+        box.append(" ", output, slider, ends);
+      } else {
+        box.append(slider, output);
+      }
+      return box;
+    });
+    at("sliders").replaceChildren(...made);
+  }
+
+  function showSliders() {
+    (two ? [0] : objectives).forEach((_, i) => {
+      at(`weight-${i}`).value = Math.round(STEPS * preference[i]);
+      at(`weight-${i}`).setAttribute("aria-valuetext", two ? described(preference) : preference[i].toFixed(2));
+      at(`weight-text-${i}`).textContent = two ? written(preference) : preference[i].toFixed(2);
+    });
+  }
+
+  function choose(w) {
+    preference = w;
+    wish += 1;
+    document.body.dataset.state = "moved";
+    at("trouble").hidden = true;
+    showSliders();
+    waiting();
+    predict();
+    clearTimeout(settling);
+    settling = setTimeout(settle, SETTLED);
+  }
+
+  // How long the last answer took to come, in ms: without what this page did meanwhile.
+  function roundTrip(action) {
+    const timed = performance.getEntriesByName(new URL(action, location.href).href).at(-1);
+    performance.clearResourceTimings();
+    return timed && timed.duration;
+  }
+
+  // One question at a time; what was moved meanwhile is asked next.
+  async function predict() {
+    if (asking) return;
+    asking = true;
+    const mine = wish;
+    try {
+      const start = performance.now();
+      const answer = await ask("/predict", { preference });
+      showPrediction(answer, roundTrip("/predict") || performance.now() - start);
+    } catch (error) {
+      complain(error);
+    }
+    asking = false;
+    document.body.dataset.ready = "true";
+    if (mine !== wish) predict();
+  }
+
+  async function settle() {
+    const mine = wish;
+    const current = () => mine === wish;
+    document.body.dataset.state = "rolling";
+    try {
+      showAround(await ask("/around", { preference }), current());
+      at("status").textContent = "Rolling out …";
+      const rollout = await ask("/rollout", { preference });
+      if (!current()) return;
+      showRollout(rollout);
+      if (!page.noFilm) {
+        at("status").textContent = "Filming …";
+        const next = await ask("/film", { preference });
+        if (!current()) return;
+        showFilm(next);
+      }
+    } catch (error) {
+      if (!current() || error.isOld) return;
+      complain(error);
+    }
+    at("status").textContent = "";
+    document.body.dataset.state = "still";
+  }
+
+  // --------------------------------------------------------------------------------------------------- answers
+
+  function makeRows() {
+    at("returns").replaceChildren(...objectives.map((name, i) => {
+      const row = element("tr");
+      row.append(element("th", name, { scope: "row" }));
+      row.append(element("td", "", { class: "predicted", id: `predicted-${i}` }));
+      row.append(element("td", "", { class: "waiting", id: `rollout-${i}` }));
+      return row;
+    }));
+  }
+
+  function fillCell(id, value, error) {
+    at(id).replaceChildren(number(value));
+    if (error !== null) at(id).append(" ", element("span", `± ${number(Number(error.toPrecision(2)))}`, { class: "error" }));
+  }
+
+  function mark(trace, values) {
+    Plotly.restyle("front", coordinates(values, page.ranges), [trace]);
+  }
+
+  function waiting() {
+    objectives.forEach((_, i) => at(`rollout-${i}`).classList.add("waiting"));
+    at("alternatives").classList.add("stale");
+    at("film-returns").classList.add("stale");
+  }
+
+  function showPrediction(answer, milliseconds) {
+    answer.returns.forEach((value, i) => fillCell(`predicted-${i}`, value, answer.error[i]));
+    mark(PREDICTED, answer.returns);
+    document.body.dataset.predicted = milliseconds.toFixed(1);
+    said.predicted = `Predicted in ${milliseconds < 10 ? milliseconds.toFixed(1) : Math.round(milliseconds)} ms; ± is the error nearby.`;
+    say();
+  }
+
+  function say() {
+    at("answered").textContent = `${said.predicted} ${said.rollout}`;
+  }
+
+  function showRollout(answer) {
+    const n = answer.n_episodes;
+    said.rollout = n === 1 ? "The rollout is one episode: nothing here is random." : `The rollout: mean ± standard deviation of ${n} episodes.`;
+    say();
+    answer.discounted.forEach((value, i) => {
+      fillCell(`rollout-${i}`, value, answer.discounted_spread && answer.discounted_spread[i]);
+      at(`rollout-${i}`).classList.remove("waiting");
+    });
+    mark(ROLLOUT, answer.discounted);
+    const made = answer.alternatives.map((one) => {
+      const item = element("li");
+      const text = element("span");
+      text.append(element("strong", written(one.preference)), ` returns ${one.returns.map(number).join(" / ")}; difference `,
+        `${number(Number(one.distance.toPrecision(2)))}, most in the ${one.differs}`);
+      const button = element("button", "Show", { type: "button", "aria-label": `Show ${described(one.preference)}` });
+      button.addEventListener("click", () => { choose(one.preference); at("choose").scrollIntoView(); });
+      item.append(text, button);
+      return item;
+    });
+    const none = element("li", "None of the policies that were rolled out returns alike and moves differently.");
+    at("alternatives").replaceChildren(...(made.length > 0 ? made : [none]));
+    at("alternatives").classList.remove("stale");
+  }
+
+  function showFilm(next) {
+    if (film !== null) URL.revokeObjectURL(film.url);
+    film = next;
+    at("film").src = urlOf(film);
+    if (!stillness) at("film").play().catch(() => {}); // It may not be allowed to; there are controls.
+    const speed = film.speed === null ? "" : `, ${Number(film.speed.toPrecision(2))}× real time`;
+    at("film-caption").textContent = `${described(film.preference)}. ${film.steps.toLocaleString("en")} steps${speed}.`;
+    at("film").setAttribute("aria-label", `Rollout under the preference ${described(film.preference)}`);
+    at("film-returns").replaceChildren(...objectives.map((name, i) => {
+      const row = element("tr");
+      const cell = element("td", undefined, { class: "spark" });
+      const height = scale(film.returns.map((r) => r[i]));
+      cell.append(sparkline(film.returns, i, height, film.returns.length - 1 || 1, "#0072b2"));
+      row.append(element("th", name, { scope: "row" }), cell, element("td", "0", { class: "now", id: `now-${i}` }));
+      row.append(element("td", number(film.total[i])));
+      return row;
+    }));
+    at("film-table").hidden = false;
+    at("film-returns").classList.remove("stale");
+    tick();
+  }
+
+  function tick() {
+    if (film !== null) showFrame(at("film"), page.fps, film.returns);
+  }
+
+  function everyFrame() {
+    tick();
+    if (!at("film").paused) requestAnimationFrame(everyFrame);
+  }
+
+  function showAround(answer, isCurrent) {
+    if (!isCurrent) return;
+    at("rates").replaceChildren(two ? rateSentences(answer.rates) : rateTable(answer.rates));
+    at("seeds").textContent = "";
+    if (answer.seeds.length === 0) return;
+    const texts = objectives.map((name, i) => {
+      const ends = [Math.min, Math.max].map((end) => number(end(...answer.seeds.map((one) => one[i]))));
+      return `${name} ${[...new Set(ends)].join(" to ")}`;
+    });
+    const n = answer.seeds.length;
+    at("seeds").textContent = `The same preference after ${n === 1 ? "one training" : `${n} trainings`} with another seed: ${texts.join(", ")}.`;
+  }
+
+  function rateSentences(rates) {
+    const list = element("ul", undefined, { class: "plain" });
+    for (const [given, gained] of [[0, 1], [1, 0]]) {
+      const rate = rates[given][gained];
+      const item = element("li");
+      const text = element("span", undefined, { class: "rate" });
+      if (rate === null) text.append(`Less in ${objectives[given]} buys nothing in ${objectives[gained]} here.`);
+      else text.append(`1 less in ${objectives[given]} buys `, element("strong", number(Number(rate.toPrecision(3)))), ` in ${objectives[gained]}.`);
+      item.append(text);
+      list.append(item);
+    }
+    return list;
+  }
+
+  function rateTable(rates) {
+    const box = element("div", undefined, { class: "scroll", tabindex: "0", role: "region", "aria-label": "Exchange rates" });
+    const table = element("table", undefined, { class: "small rate" });
+    const head = element("tr");
+    head.append(element("th", "1 less in … buys", { scope: "col" }), ...objectives.map((name) => element("th", name, { scope: "col" })));
+    table.append(element("thead"), element("tbody"));
+    table.tHead.append(head);
+    rates.forEach((line, i) => {
+      const row = element("tr");
+      row.append(element("th", objectives[i], { scope: "row" }));
+      line.forEach((rate, k) => row.append(element("td", i === k ? "" : rate === null ? "none" : number(Number(rate.toPrecision(3))))));
+      table.tBodies[0].append(row);
+    });
+    box.append(table);
+    return box;
+  }
+
+  // ----------------------------------------------------------------------------------------------------- wishes
+
+  // While it works, its button says so; what it finds is shown below it.
+  async function working(button, answerBox, work) {
+    const before = button.textContent;
+    button.disabled = true;
+    button.textContent = "Working …";
+    answerBox.replaceChildren();
+    try {
+      answerBox.replaceChildren(...(await work()));
+    } catch (error) {
+      const text = error.isOld ? "The preference was moved meanwhile: ask again." : error.message;
+      answerBox.replaceChildren(element("p", text, { class: "bad" }));
+    }
+    button.disabled = false;
+    button.textContent = before;
+    if (document.activeElement === document.body) button.focus({ preventScroll: true });
+  }
+
+  async function findBound() {
+    const before = preference;
+    const objective = Number(at("bound-objective").value);
+    const value = Number(at("bound-value").value);
+    const found = await ask("/bound", { preference, objective, [at("bound-kind").value]: value });
+    choose(found.preference);
+    const name = objectives[objective];
+    const returns = objectives.map((one, i) => `${one} ${number(found.discounted[i])}`).join(", ");
+    const of = found.n_episodes === 1 ? "its rollout" : `the mean of ${found.n_episodes} rollouts`;
+    const text = found.met
+      ? `${written(found.preference)} keeps it: ${returns} in ${of}, where at least ${number(found.at_least)} ${name} was asked for.`
+      : `No policy that was found has ${number(found.at_least)} ${name}. The closest is ${written(found.preference)}: ${returns} in ${of}.`;
+    const back = element("button", `Back to ${written(before)}`, { type: "button" });
+    back.addEventListener("click", () => choose(before));
+    return [element("p", text, { class: found.met ? "good" : "bad" }), back];
+  }
+
+  async function keepThisOne() {
+    const mine = preference;
+    const kept = await ask("/keep", { preference: mine });
+    const said = element("p", `Kept ${written(mine)} in `, { class: "good" });
+    said.append(element("code", kept.folder), `: ${kept.files.join(", ")}.`);
+    const weights = `[${mine.map((x) => Number(x.toFixed(6))).join(", ")}]`;
+    const code = `model = MOMBA.load("${kept.folder}/model.zip")\naction, _ = model.predict(obs, preference=${weights}, deterministic=True)`;
+    return [said, ...kept.notes.map((note) => element("p", note, { class: "notice" })), element("pre", code)];
+  }
+
+  function useForms() {
+    objectives.forEach((name, i) => at("bound-objective").append(element("option", name, { value: i })));
+    at("bound").addEventListener("submit", (event) => {
+      event.preventDefault();
+      working(at("bound").querySelector("button"), at("bound-answer"), findBound);
+    });
+    at("keep").addEventListener("click", () => working(at("keep"), at("kept"), keepThisOne));
+    at("film").addEventListener("play", everyFrame);
+    at("film").addEventListener("seeked", tick);
+    at("no-film").textContent = `No film: ${page.noFilm}`;
+    at("no-film").hidden = !page.noFilm;
+    at("film").hidden = Boolean(page.noFilm);
+  }
+
+  makeSliders();
+  makeRows();
+  useForms();
+  Plotly.newPlot("front", page.front.data, page.front.layout, config).then(() => {
+    at("front").on("plotly_click", (event) => {
+      const clicked = event.points.find((one) => one.customdata);
+      if (clicked) choose(page.preferences[clicked.customdata[1]]);
+    });
+    choose(page.start);
+  });
+})();
