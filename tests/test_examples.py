@@ -5,6 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+from sb3_momba.train import parse
+from sb3_momba.zoo.configuration import check_hyperparameters
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
@@ -20,6 +23,42 @@ def run(name: str, *arguments: str, cwd: Path, timeout: float = 300) -> str:
 def test_an_environment_of_ones_own(tmp_path):
     said = run("custom_environment.py", "600", cwd=tmp_path)
     assert said.count("preference [") == 5
+
+
+def test_a_preference_is_chosen_after_training(tmp_path):
+    assert "preference [" in run("choose_a_preference.py", "100", cwd=tmp_path)
+
+
+def test_one_objective(tmp_path):
+    assert "mean return -" in run("single_objective.py", "600", cwd=tmp_path)
+
+
+def test_environments_side_by_side(tmp_path):
+    assert "after 200 steps" in run("parallel_environments.py", "200", cwd=tmp_path)
+
+
+def test_a_training_goes_on(tmp_path):
+    assert "100 of 100 steps" in run("resume.py", "100", "here", cwd=tmp_path)
+    said = run("resume.py", "150", "here", cwd=tmp_path)
+    assert "Going on at 100 steps" in said
+    assert "150 of 150 steps" in said
+
+
+def test_relabelling_and_alignment(tmp_path):
+    said = run("her_and_par.py", "100", cwd=tmp_path)
+    assert said.count("hypervolume") == 2
+
+
+def test_two_methods_and_their_report(tmp_path):
+    said = run("capql_vs_momba.py", "40", "grid", cwd=tmp_path)
+    assert said.count("2/2") == 2
+    assert "## Aggregate" in said
+
+
+def test_hyperparameters_as_yaml():
+    settings = parse(["--env", "mo-hopper-2obj-v5", "--conf", str(EXAMPLES / "zoo.yml")])
+    assert (settings.steps, settings.hyperparameters["her"]) == (20_000, True)
+    assert check_hyperparameters(settings.policy, settings.hyperparameters) is None
 
 
 def test_a_sweep_and_its_report(tmp_path):
