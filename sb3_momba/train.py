@@ -94,12 +94,7 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     add_running_arguments(machine)
 
     evaluation = parser.add_argument_group("evaluation")
-    evaluation.add_argument("--eval-freq", type=whole_number, default=50_000, help="environment steps")
-    evaluation.add_argument("--n-preferences", type=int, default=protocol.N_PREFERENCES)
-    evaluation.add_argument("--n-episodes", type=int, default=protocol.N_EPISODES, help="per preference")
-    evaluation.add_argument(
-        "--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0"
-    )
+    add_protocol_arguments(evaluation)
     evaluation.add_argument("--objectives", nargs="+", help="names for the picture's axes")
 
     given = parser.parse_args(arguments)
@@ -145,6 +140,14 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         device=given.device,
         progress_bar=given.progress_bar,
     )
+
+
+def add_protocol_arguments(parser: argparse._ActionsContainer) -> None:
+    """How any method is evaluated."""
+    parser.add_argument("--eval-freq", type=whole_number, default=50_000, help="environment steps")
+    parser.add_argument("--n-preferences", type=int, default=protocol.N_PREFERENCES)
+    parser.add_argument("--n-episodes", type=int, default=protocol.N_EPISODES, help="per policy and preference")
+    parser.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0")
 
 
 def whole_number(text: str) -> int:

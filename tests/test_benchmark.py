@@ -23,7 +23,8 @@ from scipy.spatial import ConvexHull
 from sb3_momba import records, runs, train
 from sb3_momba.benchmark import local, speed
 from sb3_momba.benchmark.__main__ import main
-from sb3_momba.benchmark.grid import Cell, has_to_run, make_cells
+from sb3_momba.benchmark.execution import has_to_run
+from sb3_momba.benchmark.grid import Cell, make_cells
 from sb3_momba.benchmark.local import run_grid
 from sb3_momba.benchmark.report import write_report
 from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on, median_run

@@ -11,7 +11,7 @@ import yaml
 
 from sb3_momba import train
 from sb3_momba.baselines.settings import VARIANTS
-from sb3_momba.benchmark import grid
+from sb3_momba.benchmark import execution, grid
 from sb3_momba.benchmark.grid import Cell, as_arguments, cells_of, make_cells, merged, read_grid, shipped_grids
 from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.envs.preferences import preference_grid
@@ -147,10 +147,10 @@ def test_baselines_are_variants_like_others(tmp_path) -> None:
     settings = grid.checked([ours, theirs], tmp_path)[theirs.name]
     assert (settings.algorithm, settings.label, settings.steps) == ("gpi_ls", "gpi_ls_utd_1", 10_000)
     assert settings.hyperparameters == {"gradient_updates": 1}
-    assert grid.has_to_run(theirs, settings)
+    assert execution.has_to_run(theirs, settings)
     theirs.program.runs.record_failure(settings, "it did not start")
-    assert not grid.has_to_run(theirs, settings)
-    assert list(grid.failed([theirs], tmp_path)) == [theirs.name]
+    assert not execution.has_to_run(theirs, settings)
+    assert list(execution.failed([theirs], tmp_path)) == [theirs.name]
 
 
 def test_what_an_option_makes_alike_is_not_trained_twice(tmp_path) -> None:
@@ -162,13 +162,13 @@ def test_what_an_option_makes_alike_is_not_trained_twice(tmp_path) -> None:
 
 def test_a_folder_is_emptied_by_one_process_only(tmp_path, monkeypatch) -> None:
     """A training that goes on after its grid was killed keeps its folder."""
-    monkeypatch.setattr(grid, "SECONDS_FOR_A_LOCK", 0.1)
+    monkeypatch.setattr(execution, "SECONDS_FOR_A_LOCK", 0.1)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "model.zip").write_text("mine")
     with alone_in(tmp_path / "run"), pytest.raises(FolderInUseError):
-        grid.way_to_run(tmp_path / "run")
+        execution.way_to_run(tmp_path / "run")
     assert (tmp_path / "run" / "model.zip").exists()
-    assert grid.way_to_run(tmp_path / "run") == "begin"
+    assert execution.way_to_run(tmp_path / "run") == "begin"
     assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
 
 
@@ -178,7 +178,7 @@ def test_checkpoints_that_cannot_be_read_are_not_thrown_away(tmp_path) -> None:
     checkpoint.mkdir(parents=True)
     (checkpoint / "manifest.json").write_text("{}")
     with pytest.raises(FileFormatError):
-        grid.way_to_run(tmp_path / "run")
+        execution.way_to_run(tmp_path / "run")
     assert checkpoint.exists()
 
 

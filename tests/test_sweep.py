@@ -23,7 +23,7 @@ from ray.cluster_utils import Cluster
 from rich.console import Console
 
 from sb3_momba import runs, train
-from sb3_momba.benchmark import grid, trials
+from sb3_momba.benchmark import execution, trials
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.grid import make_cells
 from sb3_momba.checkpoints import callback
@@ -175,7 +175,7 @@ def trial(tmp_path, monkeypatch) -> Callable[..., list[dict[str, Any]]]:
     """Runs one trial in this process; what it reports."""
     reports: list[dict[str, Any]] = []
     monkeypatch.setattr(trials.tune, "report", reports.append)
-    monkeypatch.setattr(grid, "SECONDS_FOR_A_LOCK", 0.1)
+    monkeypatch.setattr(execution, "SECONDS_FOR_A_LOCK", 0.1)
     (cell,) = make_cells(["momba"], [ENV], 1, TINY.format(steps=300).split())
     settings = train.parse(cell.arguments(tmp_path / "sweep" / cell.name))
 
@@ -230,9 +230,9 @@ def test_a_full_disk_ends_a_trial_which_goes_on_from_its_checkpoint_when_asked(t
         with monkeypatch.context() as patch:
             patch.setattr(callback, "write_checkpoint", full)
             assert "No space left on device" in trial()[-1]["error"]
-        assert grid.state_of(folder) == "failed"
+        assert execution.state_of(folder) == "failed"
         trial()
-        assert grid.state_of(folder) == "failed"  # A failure is not tried again unasked.
+        assert execution.state_of(folder) == "failed"  # A failure is not tried again unasked.
         trial(retry_failed=True)
     assert ended(folder)
     assert '"resumed", "steps": 100' in (folder / "record.jsonl").read_text()

@@ -9,8 +9,7 @@ import gymnasium as gym
 
 from sb3_momba.baselines.runs import BaselineResult, run
 from sb3_momba.baselines.settings import STEPS, VARIANTS, BaselineSettings
-from sb3_momba.pareto import protocol
-from sb3_momba.train import assign, metrics_table, whole_number
+from sb3_momba.train import add_protocol_arguments, assign, metrics_table, whole_number
 
 
 def parse(arguments: Sequence[str] | None = None) -> BaselineSettings:
@@ -25,10 +24,7 @@ def parse(arguments: Sequence[str] | None = None) -> BaselineSettings:
         "--set", action="append", default=[], metavar="NAME=VALUE", help="any hyperparameter of the algorithm; may be repeated"
     )
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--eval-freq", type=whole_number, default=50_000, help="environment steps")
-    parser.add_argument("--n-preferences", type=int, default=protocol.N_PREFERENCES)
-    parser.add_argument("--n-episodes", type=int, default=protocol.N_EPISODES, help="per policy and preference")
-    parser.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume; the task's own by default, or 0")
+    add_protocol_arguments(parser)
     given = parser.parse_args(arguments)
     algorithm, not_default = VARIANTS[given.algorithm]
     hyperparameters = dict(not_default)

@@ -1,4 +1,4 @@
-"""What a grid of runs consists of: every configuration on every environment with every seed, and which of them have ended.
+"""What a grid of runs consists of: every configuration on every environment with every seed.
 
 A grid is a yaml file:
 
@@ -11,17 +11,12 @@ A grid is a yaml file:
 """
 
 import argparse
-import contextlib
 import json
-import shutil
-import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from textwrap import indent
-from typing import Any, Literal
+from typing import Any, Protocol
 
 import yaml
 
@@ -29,21 +24,13 @@ from sb3_momba import runs, train
 from sb3_momba.baselines import __main__ as baselines
 from sb3_momba.baselines import runs as baseline_runs
 from sb3_momba.baselines.settings import VARIANTS
-from sb3_momba.benchmark.results import FIXED_PREFERENCE, flat
-from sb3_momba.checkpoints.folders import newest
+from sb3_momba.benchmark.results import FIXED_PREFERENCE
 from sb3_momba.envs.preferences import preference_grid
-from sb3_momba.files import LOCK, FolderInUseError, alone_in
 from sb3_momba.pareto.evaluation import probe_environment
-from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
-from sb3_momba.runs import CHECKPOINTS
 from sb3_momba.settings import check_names, is_number, nearest, parse_ent_coef
-from sb3_momba.zoo.configuration import literal, read_configuration, with_later_settings
+from sb3_momba.zoo.configuration import literal, read_configuration
 
 SHIPPED = resources.files("sb3_momba.benchmark") / "grids"
-SECONDS_FOR_A_LOCK = 120.0  # in which the process that has lost a cell notices it and ends
-
-State = Literal["not begun", "cut off", "failed", "finished"]
-Runner = Callable[[Sequence["Cell"], Mapping[str, Any]], dict[str, str]]
 
 
 def _is_list_of_names(x: Any) -> bool:
@@ -77,18 +64,30 @@ ENTRIES: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 
 
+class Runs(Protocol):
+    """What the module of a kind of run offers; settings are its own."""
+
+    def check(self, settings: Any) -> None: ...
+
+    def run(self, settings: Any, on_step: Callable[[int], None] | None = None) -> Any: ...
+
+    def recorded_settings(self, settings: Any) -> dict[str, Any]: ...
+
+    def record_failure(self, settings: Any, error: str, traceback: str = "") -> None: ...
+
+
 @dataclass(frozen=True)
 class Program:
     """What trains a cell.
 
     :param module: of its command line, `python -m module`
     :param parse: what reads that
-    :param runs: module with `check`, `run`, `recorded_settings` and `record_failure` of the settings
+    :param runs: what does with the settings that were read
     """
 
     module: str
     parse: Callable[[Sequence[str]], Any]
-    runs: Any
+    runs: Runs
 
 
 MOMBA = Program("sb3_momba.train", train.parse, runs)
@@ -276,94 +275,6 @@ def checked(cells: Sequence[Cell], output: Path) -> dict[str, Any]:
     return settings
 
 
-def state_of(folder: Path) -> State:
-    """What has come of a run, by its record."""
-    record = folder / FILE_NAME
-    if not record.exists() or is_cut_off_at_its_start(record):
-        return "not begun"
-    error = read_record(record).error
-    return "finished" if error is None else "cut off" if error == UNENDED else "failed"
-
-
-def has_to_run(cell: Cell, settings: Any, retry_failed: bool = False) -> bool:
-    """Whether a cell never ran, was cut off, or failed and is to be tried again.
-
-    :raises ValueError: if its folder holds anything but a run with these settings
-    """
-    folder = Path(settings.output)
-    state = state_of(folder)
-    if state == "not begun":
-        if folder.exists() and (not folder.is_dir() or any(file.name not in (FILE_NAME, LOCK) for file in folder.iterdir())):
-            raise ValueError(f"{folder} holds something else than a run: choose another --output.")
-        return True
-    config = read_record(folder / FILE_NAME).config
-    theirs, ours = flat(with_later_settings(config)), flat(cell.program.runs.recorded_settings(settings))
-    differing = sorted(name for name in {*theirs, *ours} if theirs.get(name) != ours.get(name))
-    if differing:
-        raise ValueError(f"{folder} holds a run with other settings ({', '.join(differing)}): choose another --output.")
-    return state == "cut off" or (state == "failed" and retry_failed)
-
-
-def way_to_run(folder: Path, retry_failed: bool = False) -> Literal["begin", "go on"] | None:
-    """How the process that got a cell runs it: from a checkpoint, or from the start, for which its folder is emptied; None:
-    it has ended meanwhile.
-
-    :raises FolderInUseError: if a process that had lost the cell still writes into the folder after two minutes
-    :raises FileFormatError: if there are checkpoints, and none can be read
-    """
-    with alone_soon_in(folder):
-        state = state_of(folder)
-        if state == "finished" or (state == "failed" and not retry_failed):
-            return None
-        if state != "not begun":
-            with contextlib.suppress(FileNotFoundError):
-                newest(folder / CHECKPOINTS)
-                return "go on"
-        for path in folder.iterdir():
-            if path.is_dir():
-                shutil.rmtree(path)
-            elif path.name != LOCK:
-                path.unlink()
-        return "begin"
-
-
-@contextlib.contextmanager
-def alone_soon_in(folder: Path) -> Iterator[None]:
-    """`alone_in`, once the process that is there has ended."""
-    until = time.monotonic() + SECONDS_FOR_A_LOCK
-    with contextlib.ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(alone_in(folder))
-                break
-            except FolderInUseError:
-                if time.monotonic() > until:
-                    raise
-                time.sleep(0.5)
-        yield
-
-
-def run_cells(cells: Sequence[Cell], output: Path, runner: Runner, retry_failed: bool = False) -> dict[str, str]:
-    """Run what has not ended yet; the names of the cells that did not finish, now or before, each with what is known of it.
-
-    :param runner: of the cells that have to run, with what their programs have read, by name; gives what those that did not
-        finish have said last
-    :param retry_failed: run again what failed
-    :raises ValueError: for settings that cannot be, a folder that holds something else or where another grid runs, before
-        anything runs
-    :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
-    """
-    settings = checked(cells, output)
-    with alone_in(output):
-        waiting = [cell for cell in cells if has_to_run(cell, settings[cell.name], retry_failed)]
-        said = runner(waiting, settings) if waiting else {}
-        return {name: said.get(name, error) for name, error in failed(cells, output).items()}
-
-
-def log_of(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.log")
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Those that say what a grid consists of; see `cells_of`."""
     parser.add_argument("--grid", nargs="+", default=[], help=f"yaml files, or shipped: {', '.join(shipped_grids())}")
@@ -399,25 +310,3 @@ def cells_of(given: argparse.Namespace, options: Sequence[str]) -> list[Cell]:
             grid.fixed_preferences,
         )
     return merged(cells)
-
-
-def failed(cells: Sequence[Cell], output: Path) -> dict[str, str]:
-    """The cells that did not finish, by name, each with its traceback or, where it left none, its error."""
-    found = {}
-    for cell in cells:
-        state = state_of(output / cell.name)
-        if state == "not begun":
-            found[cell.name] = "no record: it never began"
-        elif state != "finished":
-            record = read_record(output / cell.name / FILE_NAME)
-            found[cell.name] = (record.traceback or str(record.error)).rstrip()
-    return found
-
-
-def end_with_failures(failures: Mapping[str, str], output: Path) -> None:
-    """Print what failed, by name, and leave with an error if anything did."""
-    for name, text in failures.items():
-        print(f"\n{name}\n{indent(text, '    ')}", file=sys.stderr)
-    if failures:
-        names = ", ".join(failures)
-        sys.exit(f"error: {len(failures)} runs failed ({names}); their logs lie beside their folders in {output}.")

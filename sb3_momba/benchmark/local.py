@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from sb3_momba.benchmark import grid
+from sb3_momba.benchmark import execution, grid
 from sb3_momba.benchmark.grid import Cell
 from sb3_momba.files import FileFormatError, FolderInUseError
 
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_failed: bool = False) -> dict[str, str]:
-    """Run what has not ended yet: see `grid.run_cells`.
+    """Run what has not ended yet: see `execution.run_cells`.
 
     :param processes: runs side by side
     """
@@ -40,7 +40,7 @@ def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_fail
                 raise
         return {cell.name: error for cell, error in zip(waiting, said, strict=True) if error is not None}
 
-    return grid.run_cells(cells, output, side_by_side, retry_failed)
+    return execution.run_cells(cells, output, side_by_side, retry_failed)
 
 
 def _run_cell(cell: Cell, settings: Any, retry_failed: bool) -> str | None:
@@ -48,22 +48,22 @@ def _run_cell(cell: Cell, settings: Any, retry_failed: bool) -> str | None:
     logger.info("%s starts", cell.name)
     folder = Path(settings.output)
     try:
-        way = grid.way_to_run(folder, retry_failed)
+        way = execution.way_to_run(folder, retry_failed)
     except (FolderInUseError, FileFormatError, OSError) as error:
         logger.info("%s is left alone: %s", cell.name, error)
         return str(error)
     if way is not None:
         arguments = ["--resume", str(folder), "--no-progress-bar"] if way == "go on" else cell.arguments(folder)
         command = [sys.executable, "-m", cell.program.module, *arguments]
-        with open(grid.log_of(folder), "ab" if way == "go on" else "wb") as log:
+        with open(execution.log_of(folder), "ab" if way == "go on" else "wb") as log:
             # Runs side by side share the cores: one thread each.
             environment = {**os.environ, "OMP_NUM_THREADS": "1"}
             ended = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
-        if grid.state_of(folder) == "not begun" and ended.returncode > 0 and ended.returncode not in INTERRUPTED:
-            said = grid.log_of(folder).read_text(errors="replace").rstrip()
+        if execution.state_of(folder) == "not begun" and ended.returncode > 0 and ended.returncode not in INTERRUPTED:
+            said = execution.log_of(folder).read_text(errors="replace").rstrip()
             last = said.splitlines()[-1] if said else "no output"
             cell.program.runs.record_failure(settings, f"it did not start: {last}", said)
-    state = grid.state_of(folder)
+    state = execution.state_of(folder)
     logger.info("%s %s", cell.name, state if state != "not begun" else "did not begin")
     return None
 
@@ -76,4 +76,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(given: argparse.Namespace, options: Sequence[str]) -> None:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     failures = run_grid(grid.cells_of(given, options), given.output, given.processes, given.retry_failed)
-    grid.end_with_failures(failures, given.output)
+    execution.end_with_failures(failures, given.output)

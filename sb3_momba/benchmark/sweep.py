@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_momba.benchmark import grid
+from sb3_momba.benchmark import execution, grid
 from sb3_momba.benchmark.grid import Cell
 
 
@@ -26,7 +26,7 @@ def run_sweep(
     max_failures: int = 10,
     retry_failed: bool = False,
 ) -> dict[str, str]:
-    """Run what has not ended yet: see `grid.run_cells`.
+    """Run what has not ended yet: see `execution.run_cells`.
 
     :param address: of a Ray cluster, "host:port" or "auto" for the one that this machine is part of; None: this machine alone
     :param workers: runs side by side; by default as many as there are processors for
@@ -56,7 +56,7 @@ def run_sweep(
             at_most = n if address is None else workers
             return trials.run_trials(waiting, settings, output.resolve(), at_most, threads, gpus, max_failures, retry_failed)
 
-    return grid.run_cells(cells, output.resolve(), on_ray, retry_failed)
+    return execution.run_cells(cells, output.resolve(), on_ray, retry_failed)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,4 +80,4 @@ def main(given: argparse.Namespace, options: Sequence[str]) -> None:
         given.max_failures,
         given.retry_failed,
     )
-    grid.end_with_failures(failures, given.output)
+    execution.end_with_failures(failures, given.output)

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from sb3_momba.benchmark import grid
+from sb3_momba.benchmark import execution
 from sb3_momba.benchmark.grid import Cell
 from sb3_momba.files import LOCK
 from sb3_momba.runs import resume
@@ -132,11 +132,11 @@ def train_cell(config: dict[str, Any]) -> None:
     try:
         if not (output / LOCK).exists():
             raise FileNotFoundError(f"{socket.gethostname()} does not see {output}: choose an --output that all nodes share.")
-        way = grid.way_to_run(folder, trial["retry_failed"])
+        way = execution.way_to_run(folder, trial["retry_failed"])
         if way is None:
             return
         with (
-            open(grid.log_of(folder), "a" if way == "go on" else "w", buffering=1) as log,
+            open(execution.log_of(folder), "a" if way == "go on" else "w", buffering=1) as log,
             contextlib.redirect_stdout(log),
             contextlib.redirect_stderr(log),
         ):
@@ -146,7 +146,7 @@ def train_cell(config: dict[str, Any]) -> None:
                 else:
                     cell.program.runs.run(settings, Progress())
             except Exception as error:
-                if grid.state_of(folder) == "not begun":
+                if execution.state_of(folder) == "not begun":
                     cell.program.runs.record_failure(settings, f"it did not start: {error}", traceback.format_exc())
                 raise
     except Exception:
