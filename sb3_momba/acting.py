@@ -1,13 +1,14 @@
-"""What makes an off-policy algorithm act on preferences: environments, prediction, exploration, episodes."""
+"""What makes an off-policy algorithm act on preferences: environments, prediction, exploration, episodes, going on."""
 
 import logging
 import os
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -15,7 +16,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
-from sb3_momba.checkpoints.training_state import given_callback, set_states_of_callbacks
+from sb3_momba.buffers import PreferenceReplayBuffer
+from sb3_momba.checkpoints.checkpoint import resume
+from sb3_momba.checkpoints.folders import Checkpoint
+from sb3_momba.checkpoints.training_state import callbacks_below, given_callback, set_states_of_callbacks
 from sb3_momba.diagnostics import NegativeReturnWatch
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
@@ -24,6 +28,8 @@ from sb3_momba.finite import all_finite
 from sb3_momba.logs import forgive_full_disks
 from sb3_momba.policies import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
+
+Self = TypeVar("Self", bound="PreferenceConditionedAlgorithm")
 
 logger = logging.getLogger(__name__)
 
@@ -35,8 +41,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     preference_sampler: PreferenceSampler | SamplerSpec | None
     deterministic_exploration: bool
     _negative_returns: NegativeReturnWatch
+    preference_alignment: bool
     _root_callback: BaseCallback | None = None
     _states_of_callbacks: dict[str, Any] | None = None  # from a checkpoint, for the callbacks of the next `learn`
+    _resumed_from: tuple[Checkpoint, PreferenceReplayBuffer] | None = None  # and the buffer that it filled
 
     @staticmethod
     def _wrap_env(env: GymEnv | str | Callable[[], gym.Env], verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -159,6 +167,24 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
 
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store the transition, then update the normalisation statistics with s_t and r_t (Algorithm 1)."""
+        assert isinstance(self._last_obs, np.ndarray)
+        observations = self._last_obs[:, : self.policy.observation_dim]
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.policy.statistics.update(observations)
+        self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
+        if self.preference_alignment:
+            self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
+
     def _setup_learn(
         self,
         total_timesteps: int,
@@ -191,7 +217,45 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             self._states_of_callbacks = None
         return total_timesteps, root
 
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "MOMBA",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train; SB3's signature.
+
+        :param total_timesteps: environment steps, over all environments
+        :param log_interval: episodes between two logs
+        :param reset_num_timesteps: False counts on from the steps made so far
+        :raises NonFiniteLossError: if the training diverges, see `train`
+        """
+        try:
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        finally:
+            for _, one in callbacks_below(self._root_callback):
+                getattr(one, "after_learn", lambda: None)()
+
     @property
     def remaining_timesteps(self) -> int:
         """What the last `learn` had before it: after `resume`, `learn(remaining_timesteps, reset_num_timesteps=False)`."""
         return max(int(self._total_timesteps) - self.num_timesteps, 0)
+
+    @classmethod
+    def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Self:
+        """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)` goes
+        on exactly as if nothing had happened, callbacks of the same kinds in the same places included: SB3's own, and others
+        that have `state_dict` and `load_state_dict`. The same holds for the bits of every number on the same machine with the
+        same versions and number of threads, for environments whose only randomness is Gymnasium's `np_random`. Where a running
+        episode does not come out as it was, it ends there, as truncated, with a warning.
+
+        :param path: folder of a MombaCheckpointCallback, or one of the checkpoints in it; damaged ones are passed over
+        :param env: an environment of the same kind, and as many
+        :param kwargs: of `load`
+        :raises FileFormatError: if no checkpoint is whole, naming what is damaged
+        :raises ValueError: if `env` is not of that kind
+        """
+        return resume(cls, path, env, **kwargs)

@@ -2,22 +2,17 @@
 
 import contextlib
 import logging
-import os
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFreq, TrainFrequencyUnit
 
 from sb3_momba.acting import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
-from sb3_momba.checkpoints.checkpoint import resume
-from sb3_momba.checkpoints.folders import Checkpoint
-from sb3_momba.checkpoints.training_state import callbacks_below
 from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
@@ -30,7 +25,6 @@ from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 from sb3_momba.settings import HER_DEFAULTS, check_other_arguments, check_settings, parameters, parse_ent_coef
 
 MAX_SKIPPED_UPDATES = 20
-Self = TypeVar("Self", bound="MOMBA")
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +81,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
     actor: Actor  # type: ignore[assignment]
     critic: Critic
     critic_target: Critic
-    _resumed_from: tuple[Checkpoint, PreferenceReplayBuffer] | None = None  # and the buffer that it filled
 
     def __init__(
         self,
@@ -256,24 +249,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
         else:
             self.ent_coef_tensor = th.tensor(start, device=self.device)
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Store the transition, then update the normalisation statistics with s_t and r_t (Algorithm 1)."""
-        assert isinstance(self._last_obs, np.ndarray)
-        observations = self._last_obs[:, : self.policy.observation_dim]
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self.policy.statistics.update(observations)
-        self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
-        if self.preference_alignment:
-            self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
-
     # -------------------------------------------------------------------------------------------------- learning
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
@@ -402,46 +377,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
             self.logger.record("train/critic_weight_norm", weight_norm(self.critic))
             self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         super().dump_logs()
-
-    def learn(
-        self: Self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "MOMBA",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """Train; SB3's signature.
-
-        :param total_timesteps: environment steps, over all environments
-        :param log_interval: episodes between two logs
-        :param reset_num_timesteps: False counts on from the steps made so far
-        :raises NonFiniteLossError: if the training diverges, see `train`
-        """
-        try:
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        finally:
-            for _, one in callbacks_below(self._root_callback):
-                getattr(one, "after_learn", lambda: None)()
-
-    # ---------------------------------------------------------------------------------------------------- saving
-
-    @classmethod
-    def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Self:
-        """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)` goes
-        on exactly as if nothing had happened, callbacks of the same kinds in the same places included: SB3's own, and others
-        that have `state_dict` and `load_state_dict`. The same holds for the bits of every number on the same machine with the
-        same versions and number of threads, for environments whose only randomness is Gymnasium's `np_random`. Where a running
-        episode does not come out as it was, it ends there, as truncated, with a warning.
-
-        :param path: folder of a MombaCheckpointCallback, or one of the checkpoints in it; damaged ones are passed over
-        :param env: an environment of the same kind, and as many
-        :param kwargs: of `load`
-        :raises FileFormatError: if no checkpoint is whole, naming what is damaged
-        :raises ValueError: if `env` is not of that kind
-        """
-        return resume(cls, path, env, **kwargs)
 
 
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:

@@ -19,14 +19,14 @@ from sb3_momba.checkpoints.training_state import (
 from sb3_momba.files import FileFormatError, content_of, read_tree
 
 if TYPE_CHECKING:
-    from sb3_momba.momba import MOMBA
+    from sb3_momba.acting import PreferenceConditionedAlgorithm
 
 MODEL, STATE = "model.zip", "state.zip"
 
-Model = TypeVar("Model", bound="MOMBA")
+Model = TypeVar("Model", bound="PreferenceConditionedAlgorithm")
 
 
-def write_checkpoint(model: "MOMBA", writer: CheckpointWriter) -> None:
+def write_checkpoint(model: "PreferenceConditionedAlgorithm", writer: CheckpointWriter) -> None:
     """Between two rollouts, when the last transition is stored and its updates are made."""
     assert model.env is not None
     segments, buffer = write_segments(model.replay_buffer, writer)
@@ -68,7 +68,7 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
     return model
 
 
-def _bring_back_environments(model: "MOMBA", episodes: list[dict[str, Any]] | None) -> None:
+def _bring_back_environments(model: "PreferenceConditionedAlgorithm", episodes: list[dict[str, Any]] | None) -> None:
     assert model.env is not None
     assert model._last_obs is not None
     model._last_obs, lost = environments.bring_back(model.env, episodes, model._last_obs)  # type: ignore[arg-type]
