@@ -23,6 +23,7 @@ from sb3_momba.checkpoints.training_state import callbacks_below, given_callback
 from sb3_momba.diagnostics import NegativeReturnWatch
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.exploration import HeldNoise
 from sb3_momba.export import export_policy
 from sb3_momba.finite import all_finite
 from sb3_momba.logs import forgive_full_disks
@@ -40,6 +41,8 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     policy: MombaPolicy
     preference_sampler: PreferenceSampler | SamplerSpec | None
     deterministic_exploration: bool
+    noise_repeat: int
+    _held_noise: HeldNoise
     _negative_returns: NegativeReturnWatch
     preference_alignment: bool
     _root_callback: BaseCallback | None = None
@@ -157,12 +160,16 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's is asked for."""
-        if not self.deterministic_exploration or self.num_timesteps < learning_starts:
+        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's or noise that is
+        kept is asked for."""
+        if self.num_timesteps < learning_starts or not (self.deterministic_exploration or self.noise_repeat > 1):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, np.ndarray)
-        action, _ = self.predict(self._last_obs, deterministic=True)
-        scaled = self.policy.scale_action(action)
+        if self.deterministic_exploration:
+            action, _ = self.predict(self._last_obs, deterministic=True)
+            scaled = self.policy.scale_action(action)
+        else:
+            scaled = self.policy.explore(self._last_obs, self._held_noise)
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled

@@ -48,6 +48,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
     :param n_steps: transitions that one reward sums over, cut short where an episode ends
     :param keep_probability: p_keep of hindsight relabelling, eq. (3.20); 1 switches it off
     :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
+    :param n_relabels: rows of a minibatch that come from one transition, each with a preference of its own
     :param seed: of the buffer's own random stream
     :param handle_timeout_termination: SB3's switch, always on: a truncated episode's last state keeps its value
     :raises ValueError: for a switch that is turned, or a number out of its range
@@ -69,6 +70,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         n_steps: int = 1,
         keep_probability: float = 1.0,
         concentration: float = 5.0,
+        n_relabels: int = 1,
         seed: int | None = None,
         handle_timeout_termination: bool = True,
     ):
@@ -78,6 +80,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
             raise ValueError("handle_timeout_termination=False takes a truncated episode for a terminated one: leave it True.")
         if n_steps < 1:
             raise ValueError(f"n_steps={n_steps}: a return sums over at least 1 step.")
+        if n_relabels < 1:
+            raise ValueError(f"n_relabels={n_relabels}: each transition has at least 1 preference.")
         if not 0 <= keep_probability <= 1 or concentration <= 0:
             raise ValueError(
                 f"keep_probability={keep_probability}, concentration={concentration}: the first is a probability, the "
@@ -96,6 +100,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self.n_steps = n_steps
         self.keep_probability = keep_probability
         self.concentration = concentration
+        self.n_relabels = n_relabels
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -229,19 +234,22 @@ class PreferenceReplayBuffer(ReplayBuffer):
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> PreferenceReplayBufferSamples:  # type: ignore[override]
         """Uniformly, with replacement, and relabelled by eq. (3.20) where hindsight is on.
 
-        :raises ValueError: if nothing is stored yet
+        :raises ValueError: if nothing is stored yet, or if n_relabels does not divide the batch
         """
         upper = self.buffer_size if self.full else self.pos
         if upper == 0:
             raise ValueError("The replay buffer is empty: nothing to sample.")
-        return self._get_samples(self.rng.integers(upper, size=batch_size), env)
+        if batch_size % self.n_relabels != 0:
+            raise ValueError(f"batch_size={batch_size} is no multiple of n_relabels={self.n_relabels}.")
+        return self._get_samples(self.rng.integers(upper, size=batch_size // self.n_relabels), env)
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
     ) -> PreferenceReplayBufferSamples:
         if env is not None:
             raise ValueError("VecNormalize is not needed: the policy normalises observations, and rewards by their returns.")
-        env_inds = self.rng.integers(self.n_envs, size=len(batch_inds))
+        env_inds = self.rng.integers(self.n_envs, size=len(batch_inds)).repeat(self.n_relabels)
+        batch_inds = batch_inds.repeat(self.n_relabels)
         rewards, discounts, last_inds = self._n_step_returns(batch_inds, env_inds)
         preferences = self._relabel(self.preferences[batch_inds, env_inds])
         appended = preferences[:, : self.preference_dim]

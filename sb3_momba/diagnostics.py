@@ -18,16 +18,19 @@ class TrainingMetrics:
 
     def __init__(self) -> None:
         self.sums: Metrics = {}
-        self.count = 0
+        self.counts: dict[str, int] = {}
         self.n_updates = 0
         self.blind_updates: th.Tensor | int = 0
         self.warned_blind = False
 
     def add(self, metrics: Metrics) -> None:
-        """:param metrics: of one update; scalars, or one number per objective; with `target_end_mass`"""
+        """
+        :param metrics: of one update, which need not be the same in all; scalars, or one number per objective; with
+            `target_end_mass`
+        """
         for name, value in metrics.items():
             self.sums[name] = self.sums[name] + value if name in self.sums else value
-        self.count += 1
+            self.counts[name] = self.counts.get(name, 0) + 1
         self.n_updates += 1
         self.blind_updates = (self.blind_updates + 1) * (metrics["target_end_mass"] > 0.5)
         if not self.warned_blind and self.n_updates % BLIND_UPDATES == 0 and self.blind_updates >= BLIND_UPDATES:
@@ -42,10 +45,10 @@ class TrainingMetrics:
     def record(self, logger: Logger) -> None:
         """Write the means since the last call as `train/NAME`, or `train/NAME_i` for each objective."""
         for name, total in self.sums.items():
-            mean = np.atleast_1d((total / self.count).cpu().numpy())
+            mean = np.atleast_1d((total / self.counts[name]).cpu().numpy())
             for i, number in enumerate(mean):
                 logger.record(f"train/{name}" + (f"_{i}" if len(mean) > 1 else ""), float(number))
-        self.sums, self.count = {}, 0
+        self.sums, self.counts = {}, {}
 
 
 class NegativeReturnWatch:

@@ -10,19 +10,28 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_momba.acting import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
 from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
+from sb3_momba.exploration import HeldNoise
 from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.nn.speed import keep_freed_memory, without_weight_gradients
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
-from sb3_momba.settings import HER_DEFAULTS, check_other_arguments, check_settings, parameters, parse_ent_coef
+from sb3_momba.settings import (
+    HER_DEFAULTS,
+    check_other_arguments,
+    check_settings,
+    parameters,
+    parse_ent_coef,
+    parse_target_entropy,
+)
 
 MAX_SKIPPED_UPDATES = 20
 
@@ -50,11 +59,15 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param critic_loss: "ce", distributional critics (section 3.2), or "mse", expected values
     :param vector_values: critics of the vector return (section 3.2.2) instead of the scalarised one (3.2.1)
     :param her: relabel preferences in hindsight, eq. (3.20)
-    :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0)`
+    :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0, n_relabels=1)`: see PreferenceReplayBuffer
     :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
     :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
-    :param target_entropy: of the policy on [-1, 1], in nats; "auto": `-|A|`
+    :param target_entropy: of the policy on [-1, 1], in nats; "auto": `-|A|`; "std_0.15": that of a Gaussian with this standard
+        deviation in each dimension (FlashSAC)
+    :param ent_coef_learning_rate: of the entropy coefficient alone; None: `learning_rate`
+    :param policy_delay: updates of the critics for each of the actor and the entropy coefficient (TD3, Fujimoto et al., 2018)
+    :param noise_repeat: most steps for which the noise of one sampled action is kept (FlashSAC); 1: new noise at every step
     :param preference_sampler: `rng -> (n_objectives,)` for all environments, or a literal as `make_sampler` takes it; None
         leaves them theirs, by default uniform on the simplex once an episode
     :param precision: of an update's products: "float32", "bfloat16", or "auto", bfloat16 if the device has instructions for it
@@ -104,6 +117,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
         best_return_scale: float | None = 3.0,
         ent_coef: str | float = "auto_0.2",
         target_entropy: str | float = "auto",
+        ent_coef_learning_rate: float | None = None,
+        policy_delay: int = 1,
+        noise_repeat: int = 1,
         preference_sampler: PreferenceSampler | SamplerSpec | None = None,
         precision: str = "float32",
         compile: bool = False,
@@ -164,6 +180,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self.best_return_scale = best_return_scale
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
+        self.ent_coef_learning_rate = ent_coef_learning_rate
+        self.policy_delay = policy_delay
+        self.noise_repeat = noise_repeat
         self.preference_sampler = preference_sampler
         self.log_ent_coef: th.Tensor | None = None
         self.ent_coef_optimizer: th.optim.Optimizer | None = None
@@ -192,6 +211,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         for network in (self.actor, self.critic, self.critic_target):
             network.compiled = self.compile
         self._setup_entropy_coefficient()
+        self._held_noise = HeldNoise(self.noise_repeat)
         self._metrics = TrainingMetrics()
         self._negative_returns = NegativeReturnWatch()
         self._skipped_updates = 0
@@ -239,9 +259,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def _setup_entropy_coefficient(self) -> None:
         """alpha = exp(beta), learned or fixed (section 3.4.2)."""
-        if self.target_entropy == "auto":
-            self.target_entropy = -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
-        self.target_entropy = float(self.target_entropy)
+        self.target_entropy = parse_target_entropy(self.target_entropy, int(np.prod(self.action_space.shape)))  # type: ignore[arg-type]
         learned, start = parse_ent_coef(self.ent_coef)
         if learned:
             self.log_ent_coef = th.tensor(start, device=self.device).log().requires_grad_(True)
@@ -263,6 +281,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
+        if self.ent_coef_optimizer is not None and self.ent_coef_learning_rate is not None:
+            update_learning_rate(self.ent_coef_optimizer, self.ent_coef_learning_rate)
 
         with fast_float32_products():
             for _ in range(gradient_steps):
@@ -276,19 +296,25 @@ class MOMBA(PreferenceConditionedAlgorithm):
         """One pass through the inner loop of Algorithm 1."""
         alpha = self.alpha
         with self._rounded_products():
-            critic_loss, critic_metrics = self._critic_loss(batch, alpha)
+            critic_loss, metrics = self._critic_loss(batch, alpha)
         descend(self.critic.optimizer, critic_loss, "critic")
         try:
-            with self._rounded_products(), without_weight_gradients(self.critic):
-                actor_loss, log_prob, actor_metrics = self._actor_loss(batch, alpha)
-            descend(self.actor.optimizer, actor_loss, "actor")
-            if self.ent_coef_optimizer is not None:
-                descend(self.ent_coef_optimizer, self._alpha_loss(log_prob), "entropy coefficient")
+            if self._n_updates % self.policy_delay == 0:
+                metrics |= self._improve_policy(batch, alpha)
         finally:  # The critics have taken their step, even where the actor's is skipped.
             self.policy.project_weights()
             move_towards(self.critic_target, self.critic, self.tau)
         self._n_updates += 1
-        self._metrics.add({**critic_metrics, **actor_metrics, "ent_coef": alpha})
+        self._metrics.add({**metrics, "ent_coef": alpha})
+
+    def _improve_policy(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> Metrics:
+        """The steps of the actor and the entropy coefficient."""
+        with self._rounded_products(), without_weight_gradients(self.critic):
+            actor_loss, log_prob, metrics = self._actor_loss(batch, alpha)
+        descend(self.actor.optimizer, actor_loss, "actor")
+        if self.ent_coef_optimizer is not None:
+            descend(self.ent_coef_optimizer, self._alpha_loss(log_prob), "entropy coefficient")
+        return metrics
 
     def _rounded_products(self) -> contextlib.AbstractContextManager[None]:
         """Inside, products' factors are rounded as `precision` says. One context per loss: it keeps the rounded weights."""
@@ -370,7 +396,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def dump_logs(self) -> None:
         """Write the log, with the means of the training metrics since the last time."""
-        if self._metrics.count > 0:
+        if self._metrics.sums:
             self._metrics.record(self.logger)
             self.logger.record("train/return_scale", self.policy.return_scale.factor)
             self.logger.record("train/actor_weight_norm", weight_norm(self.actor))

@@ -1,8 +1,10 @@
 """SimbaPolicy and MlpPolicy: actor, critic ensemble, target critics and running statistics in one module."""
 
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
@@ -127,6 +129,17 @@ class MombaPolicy(BasePolicy):
         if self.normalize_weights:
             project_weights(self.actor)
             project_weights(self.critic)
+
+    @th.no_grad()
+    def explore(self, observation: np.ndarray, noise: Callable[[th.Tensor], th.Tensor]) -> np.ndarray:
+        """Actions on [-1, 1], (batch, action_dim), sampled with this standard normal noise.
+
+        :param observation: raw [s, w], (batch, observation_dim + preference_dim)
+        :param noise: of the shape of the mean that it is given
+        """
+        self.set_training_mode(False)
+        mean, log_std = self.actor.distribution(self.normalize(th.as_tensor(observation, device=self.device)))
+        return th.tanh(mean + log_std.exp() * noise(mean)).cpu().numpy()
 
     def set_training_mode(self, mode: bool) -> None:
         """SB3's, which acting and learning call in turn at every step; nn.Module's own way takes half as long as acting."""

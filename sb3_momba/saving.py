@@ -201,9 +201,10 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         self.replay_buffer = buffer
 
     def _excluded_save_params(self) -> list[str]:
-        derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor", "_metrics", "_negative_returns"]
+        derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor"]
+        of_the_training = ["_metrics", "_negative_returns", "_held_noise"]
         of_the_process = ["_root_callback", "_states_of_callbacks", "_resumed_from"]
-        return [*super()._excluded_save_params(), *derived, *of_the_process]
+        return [*super()._excluded_save_params(), *derived, *of_the_training, *of_the_process]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         if self.ent_coef_optimizer is None:

@@ -1,6 +1,7 @@
 """What MOMBA's settings may be. Every check raises a ValueError that names the setting, its value and the cure."""
 
 import inspect
+import math
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from numbers import Integral, Real
@@ -16,7 +17,8 @@ from sb3_momba.nn.speed import has_compiler
 from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
 
 SWITCHES = ("vector_values", "her", "preference_alignment", "compile", "deterministic_exploration", "optimize_memory_usage")
-WHOLE_NUMBERS = {"batch_size": 1, "buffer_size": 1, "learning_starts": 0, "n_steps": 1}  # and the least that they may be
+# The least that they may be.
+WHOLE_NUMBERS = {"batch_size": 1, "buffer_size": 1, "learning_starts": 0, "n_steps": 1, "policy_delay": 1, "noise_repeat": 1}
 RANGES = {"gamma": (0, 1), "tau": (0, 1)}
 CHOICES = {
     "critic_loss": ("ce", "mse"),
@@ -24,8 +26,8 @@ CHOICES = {
     "critic_loss_reduction": ("sum", "mean"),
     "precision": PRECISIONS,
 }
-BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "seed", "handle_timeout_termination")
-HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0}
+BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "n_relabels", "seed", "handle_timeout_termination")
+HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1}
 
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
 POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")
@@ -95,8 +97,10 @@ def check_settings(model: Any) -> None:
     mean: Any = getattr(noise, "_mu", None)
     if mean is not None and np.shape(mean) not in ((), model.action_space.shape):
         raise ValueError(f"action_noise={noise!r} has shape {np.shape(mean)}, an action {model.action_space.shape}.")
-    if entropy != "auto" and not is_number(entropy):
-        raise ValueError(f'target_entropy={entropy!r}: give "auto" or a number of nats.')
+    parse_target_entropy(entropy, 1)
+    own_rate = settings["ent_coef_learning_rate"]
+    if own_rate is not None and not (is_number(own_rate) and own_rate >= 0):
+        raise ValueError(f"ent_coef_learning_rate={own_rate!r}: give a number of at least 0, or None for learning_rate.")
     _check_together(model, settings)
     check_policy_kwargs(model.policy_class, settings["policy_kwargs"])
 
@@ -115,6 +119,10 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
         for name, value in model.her_kwargs.items():
             if not is_number(value):
                 raise ValueError(f"her_kwargs={{{name!r}: {value!r}}}: give a number.")
+        relabels = model.her_kwargs.get("n_relabels", 1)
+        check_whole("her_kwargs n_relabels", relabels, 1)
+        if model.batch_size % relabels != 0:
+            raise ValueError(f"her_kwargs n_relabels={relabels} does not divide batch_size={model.batch_size}.")
     if model.compile and not has_compiler():
         raise ValueError(
             "compile=True needs a C++ compiler, and there is none (g++, clang++, or CXX): install one, or leave it out."
@@ -188,6 +196,25 @@ def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
             f'ent_coef={ent_coef!r}: give "auto", "auto_0.2" (a start above 0), or a number that is not negative.'
         ) from error
     return learned, start
+
+
+def parse_target_entropy(target_entropy: str | float, action_dim: int) -> float:
+    """Nats of the whole action: "auto", -action_dim (SAC); "std_0.15", action_dim / 2 * ln(2 pi e 0.15^2), the entropy of a
+    Gaussian with that standard deviation in each dimension (FlashSAC); or a number as it is."""
+    if target_entropy == "auto":
+        return -float(action_dim)
+    if is_number(target_entropy):
+        return float(target_entropy)
+    text = str(target_entropy)
+    try:
+        deviation = float(text.removeprefix("std_")) if text.startswith("std_") else 0.0
+    except ValueError:
+        deviation = 0.0
+    if not 0 < deviation < float("inf"):
+        raise ValueError(
+            f'target_entropy={target_entropy!r}: give "auto", "std_0.15" (a deviation above 0), or a number of nats.'
+        )
+    return action_dim / 2 * math.log(2 * math.pi * math.e * deviation**2)
 
 
 def check_switch(name: str, value: Any) -> None:

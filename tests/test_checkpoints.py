@@ -73,6 +73,7 @@ VARIANTS = {
     "noise that remembers, three environments": {
         **{"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5)), "n_envs": 3},
     },
+    "held noise, a delayed actor": {"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15"},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},
 }
 

@@ -52,6 +52,7 @@ def statistics_of(model: Any) -> dict[str, Any]:
         "metrics": vars(model._metrics),
         "negative_returns": vars(model._negative_returns),
         "skipped_updates": model._skipped_updates,
+        "held_noise": vars(model._held_noise),
     }
 
 
@@ -61,7 +62,10 @@ def set_statistics(model: Any, statistics: dict[str, Any]) -> None:
     metrics["sums"] = {name: total.to(model.device) for name, total in metrics["sums"].items()}
     if isinstance(metrics["blind_updates"], th.Tensor):
         metrics["blind_updates"] = metrics["blind_updates"].to(model.device)
+    if "count" in metrics:  # of earlier checkpoints: one for all
+        metrics["counts"] = dict.fromkeys(metrics["sums"], metrics.pop("count"))
     vars(model._metrics).update(metrics)
+    vars(model._held_noise).update(statistics.get("held_noise", {}))
     vars(model._negative_returns).update(statistics["negative_returns"])
     model._skipped_updates = statistics["skipped_updates"]
 

@@ -125,17 +125,20 @@ def check_entry(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_schedules(hyperparameters: dict[str, Any]) -> dict[str, Any]:
-    """A learning rate "lin_3e-4" falls linearly from 3e-4 to 0, as in rl_zoo3.
+    """A learning rate "lin_3e-4" falls linearly from 3e-4 to 0, as in rl_zoo3; "lin_3e-4_1e-4" from 3e-4 to 1e-4.
 
     :raises ValueError: for any other string
     """
     rate = hyperparameters.get("learning_rate")
     if not isinstance(rate, str):
         return hyperparameters
-    start = number_in(rate.removeprefix(LINEAR)) if rate.startswith(LINEAR) else None
-    if start is None:
-        raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or {LINEAR}3e-4 to fall from it to 0.")
-    return {**hyperparameters, "learning_rate": LinearSchedule(start, 0.0, 1.0)}
+    first, _, last = rate.removeprefix(LINEAR).partition("_")
+    start, end = number_in(first), number_in(last or "0")
+    if not rate.startswith(LINEAR) or start is None or end is None:
+        raise ValueError(
+            f"learning_rate={rate!r}: give a number of at least 0, {LINEAR}3e-4 to fall from it to 0, or {LINEAR}3e-4_1e-4."
+        )
+    return {**hyperparameters, "learning_rate": LinearSchedule(start, end, 1.0)}
 
 
 def number_in(text: str) -> float | None:

@@ -1,0 +1,28 @@
+"""Noise that moves actions the same way for several steps, which single draws at every step average away."""
+
+import torch as th
+
+EXPONENT = 2.0
+
+
+class HeldNoise:
+    """Standard normal noise, each draw kept for n steps of its environment, P(n) proportional to n^-2 (the zeta distribution
+    of Dabney et al., 2021, cut off as in FlashSAC).
+
+    :param longest: largest n
+    """
+
+    def __init__(self, longest: int):
+        self.probabilities = th.arange(1, longest + 1, dtype=th.float64) ** -EXPONENT
+        self.noise: th.Tensor | None = None
+        self.steps_left = th.zeros(0, dtype=th.int64)
+
+    def __call__(self, like: th.Tensor) -> th.Tensor:
+        """The noise of the next step, of the shape of `like`, (n_envs, action_dim)."""
+        if self.noise is None or self.noise.shape != like.shape:
+            self.noise, self.steps_left = th.zeros_like(like), th.zeros(len(like), dtype=th.int64)
+        ended = self.steps_left == 0
+        drawn = th.multinomial(self.probabilities, len(like), replacement=True) + 1
+        self.noise = th.where(ended[:, None].to(like.device), th.randn_like(like), self.noise)
+        self.steps_left = th.where(ended, drawn, self.steps_left) - 1
+        return self.noise

@@ -1,0 +1,179 @@
+"""What MOMBA can do beyond the thesis, one argument each: hand-computed numbers first, then that the default is untouched."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_momba import MOMBA
+from sb3_momba.exploration import HeldNoise
+from sb3_momba.settings import parse_target_entropy
+from sb3_momba.zoo.configuration import with_schedules
+from tests.stubs import StubEnv, tiny_model
+
+
+def parameters_of(network: th.nn.Module) -> list[th.Tensor]:
+    return [parameter.detach().clone() for parameter in network.parameters()]
+
+
+def same(first: list[th.Tensor], second: list[th.Tensor], tolerance: float = 0.0) -> bool:
+    return all(float((a - b).abs().max()) <= tolerance for a, b in zip(first, second, strict=True))
+
+
+def trained(**kwargs) -> MOMBA:
+    """A model with 40 transitions and no update yet."""
+    return tiny_model(StubEnv(), learning_starts=100, **kwargs).learn(40)
+
+
+# ------------------------------------------------------------------------------------------------------ policy_delay
+
+
+def test_the_actor_and_alpha_move_with_every_third_update_and_the_critics_with_all():
+    model = trained(policy_delay=3, learning_rate=1e-3)
+    moved = []
+    for _ in range(6):
+        before = parameters_of(model.actor), parameters_of(model.critic), model.alpha.clone()
+        model.train(1, 8)
+        after = parameters_of(model.actor), parameters_of(model.critic), model.alpha
+        # Unit rows are projected again in any case, which may change their last bit.
+        moved.append(
+            (not same(before[0], after[0], 1e-6), not same(before[1], after[1], 1e-6), not th.equal(before[2], after[2]))
+        )
+    assert moved == [(True, True, True), (False, True, False), (False, True, False)] * 2
+
+
+def test_a_metric_is_the_mean_over_the_updates_that_had_it():
+    model = trained(policy_delay=2)
+    model.train(4, 8)
+    assert model._metrics.counts["actor_loss"] == 2
+    assert model._metrics.counts["critic_loss"] == 4
+    logged = {}
+    model._metrics.sums["actor_loss"] = th.tensor(3.0)
+    model._metrics.record(type("Log", (), {"record": lambda _, name, value: logged.update({name: value})})())
+    assert logged["train/actor_loss"] == 1.5
+
+
+# --------------------------------------------------------------------------------------------------- entropy target
+
+
+def test_the_target_of_a_standard_deviation():
+    """FlashSAC's number: -0.478 for each dimension at 0.15."""
+    assert parse_target_entropy("std_0.15", 1) == pytest.approx(-0.47818, abs=1e-5)
+    assert parse_target_entropy("std_0.15", 6) == pytest.approx(6 * parse_target_entropy("std_0.15", 1))
+    gaussian = th.distributions.Normal(0, 0.3).entropy()
+    assert parse_target_entropy("std_0.3", 2) == pytest.approx(2 * float(gaussian), rel=1e-6)
+    assert (parse_target_entropy("auto", 3), parse_target_entropy(-1.5, 3)) == (-3.0, -1.5)
+    assert trained(target_entropy="std_0.15").target_entropy == pytest.approx(math.log(2 * math.pi * math.e * 0.0225))
+
+
+@pytest.mark.parametrize("wrong", ["std_", "std_0", "std_-1", "std_inf", "std_x", "0.15", True, None], ids=str)
+def test_a_wrong_target_is_named(wrong):
+    with pytest.raises(ValueError, match=r"target_entropy=.*std_0\.15"):
+        tiny_model(StubEnv(), target_entropy=wrong)
+
+
+def test_alpha_has_a_learning_rate_of_its_own():
+    """Adam's first step is the learning rate, whatever the gradient."""
+    model = trained(ent_coef="auto_0.2", ent_coef_learning_rate=0.05, learning_rate=1e-3)
+    model.train(1, 8)
+    assert abs(math.log(float(model.alpha) / 0.2)) == pytest.approx(0.05, rel=1e-3)
+    assert model.critic.optimizer.param_groups[0]["lr"] == model.actor.optimizer.param_groups[0]["lr"] == 1e-3
+
+
+# ------------------------------------------------------------------------------------------------------ held noise
+
+
+def lengths_of(noises: list[th.Tensor]) -> list[int]:
+    """How long each value of a sequence stays."""
+    changes = [i for i in range(1, len(noises)) if not th.equal(noises[i], noises[i - 1])]
+    return np.diff([0, *changes]).tolist()
+
+
+def test_noise_is_held_for_zeta_distributed_times_by_each_environment():
+    """P(n) = n^-2 / (1 + 1/4 + 1/9) for n <= 3: 0.7347, 0.1837, 0.0816. Tolerances are four standard errors."""
+    th.manual_seed(0)
+    held = HeldNoise(3)
+    noises = th.stack([held(th.zeros(2, 4)) for _ in range(20_000)])
+    lengths = np.array(lengths_of(list(noises[:, 0])))
+    assert set(lengths) == {1, 2, 3}
+    np.testing.assert_allclose(np.bincount(lengths)[1:] / len(lengths), [36 / 49, 9 / 49, 4 / 49], atol=0.016)
+    assert abs(float(noises.mean())) < 0.03
+    assert float(noises.std()) == pytest.approx(1, abs=0.03)
+    assert not th.equal(noises[:, 0], noises[:, 1])
+    assert len(set(map(float, noises[0].flatten()))) == 8
+
+
+def test_the_noise_of_longest_one_is_new_at_every_step():
+    held = HeldNoise(1)
+    assert set(lengths_of([held(th.zeros(1, 2)) for _ in range(50)])) == {1}
+
+
+def test_actions_are_the_mean_and_the_deviation_under_the_held_noise():
+    model = tiny_model(StubEnv(), noise_repeat=8, learning_starts=5)
+    model.learn(30)
+    last_obs = th.as_tensor(model._last_obs)
+    with th.no_grad():
+        mean, log_std = model.actor.distribution(model.policy.normalize(last_obs))
+    _, scaled = model._sample_action(0)
+    np.testing.assert_array_equal(scaled, th.tanh(mean + log_std.exp() * model._held_noise.noise).numpy())
+    assert model._held_noise.steps_left.min() >= 0
+
+
+def test_the_first_actions_stay_uniform():
+    model = tiny_model(StubEnv(), noise_repeat=8, learning_starts=30).learn(20)
+    assert model._held_noise.noise is None
+
+
+# ------------------------------------------------------------------------------------------------------- relabelling
+
+
+def test_several_relabels_of_each_transition():
+    model = tiny_model(StubEnv(), her=True, her_kwargs={"n_relabels": 4, "keep_probability": 0.0}, learning_starts=100)
+    model.learn(60)
+    model.replay_buffer.preferences[:] = 0.5  # In a corner all four may be the corner itself.
+    batch = model.replay_buffer.sample(32)
+    actions = batch.actions.reshape(8, 4, -1)
+    assert th.equal(actions, actions[:, :1].expand(-1, 4, -1))
+    assert len(th.unique(actions[:, 0], dim=0)) > 1
+    assert all(len(th.unique(w, dim=0)) == 4 for w in batch.preferences.reshape(8, 4, -1))
+    model.train(2, 8)
+
+
+@pytest.mark.parametrize(("n_relabels", "said"), [(3, "does not divide batch_size=8"), (0, "whole number"), (1.5, "whole")])
+def test_wrong_numbers_of_relabels_are_named(n_relabels, said):
+    with pytest.raises(ValueError, match=rf"n_relabels={n_relabels}.*{said}"):
+        tiny_model(StubEnv(), her=True, her_kwargs={"n_relabels": n_relabels}, batch_size=8)
+
+
+# ------------------------------------------------------------------------------------------------------- schedules
+
+
+def test_a_learning_rate_that_falls_to_another():
+    rate = with_schedules({"learning_rate": "lin_3e-4_1e-4"})["learning_rate"]
+    assert [rate(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([3e-4, 2e-4, 1e-4])
+    with pytest.raises(ValueError, match="lin_3e-4_1e-4"):
+        with_schedules({"learning_rate": "lin_3e-4_x"})
+
+
+# -------------------------------------------------------------------------------------------------------- all of it
+
+NEUTRAL = {"policy_delay": 1, "noise_repeat": 1, "ent_coef_learning_rate": None, "target_entropy": "auto"}
+
+
+def test_neutral_values_are_the_default():
+    default, neutral = tiny_model(StubEnv()).learn(60), tiny_model(StubEnv(), **NEUTRAL).learn(60)
+    assert same(parameters_of(default.policy), parameters_of(neutral.policy))
+
+
+@pytest.mark.parametrize("name", ["policy_delay", "noise_repeat"])
+@pytest.mark.parametrize("wrong", [0, -1, 1.5, True], ids=str)
+def test_wrong_whole_numbers_are_named(name, wrong):
+    with pytest.raises(ValueError, match=rf"{name}={wrong}.*whole number of at least 1"):
+        tiny_model(StubEnv(), **{name: wrong})
+
+
+@pytest.mark.parametrize("wrong", [-1e-3, "fast", float("nan")], ids=str)
+def test_a_wrong_learning_rate_of_alpha_is_named(wrong):
+    with pytest.raises(ValueError, match="ent_coef_learning_rate="):
+        tiny_model(StubEnv(), ent_coef_learning_rate=wrong)
