@@ -363,7 +363,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
                 "critic_loss": loss.detach(),
                 "q": value.mean(outputs).mean(dim=(0, 1)),
                 "target_end_mass": value.end_mass(target).mean(),
-                "feature_norm": th.linalg.vector_norm(features, dim=-1).mean(),
+                "feature_norm": th.linalg.vector_norm(features, dim=-1, dtype=th.float32).mean(),
             }
         return loss, metrics
 

@@ -6,7 +6,7 @@ import torch as th
 from sb3_momba import MOMBA
 from sb3_momba.nn import products
 from sb3_momba.nn.products import fast_float32_products, onednn_keeps_float32
-from tests.stubs import TINY_SIMBA, StubEnv
+from tests.stubs import StubEnv, tiny_model
 
 pytestmark = pytest.mark.skipif(not hasattr(th.backends.mkldnn, "matmul"), reason="torch before 2.9 has no such setting")
 
@@ -102,9 +102,9 @@ def test_gradients_of_rounded_products_point_the_same_way(policy, critic_loss, v
         assert th.cosine_similarity(a, b, dim=0) >= 0.99
 
 
-def test_weights_and_statistics_stay_float32_in_training_with_rounded_products():
-    model = MOMBA("SimbaPolicy", StubEnv(), seed=0, precision="bfloat16", learning_starts=20, policy_kwargs=TINY_SIMBA)
-    model.learn(40)
+@pytest.mark.parametrize("policy", MOMBA.policy_aliases)
+def test_weights_and_statistics_stay_float32_in_training_with_rounded_products(policy):
+    model = tiny_model(StubEnv(), policy, precision="bfloat16").learn(40)
     assert model._n_updates > 0
     assert {p.dtype for p in model.policy.parameters()} == {th.float32}
 

@@ -195,7 +195,8 @@ class Actor(nn.Module):
     def distribution(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before tanh, each (batch, action_dim)."""
         features = self.trunk(observations, observations[:, self.observation_dim :])
-        return self.mean_head(features), self.squash_log_std(self.log_std_head(features))
+        # A product with its bias comes rounded; what follows from it is float32.
+        return self.mean_head(features).float(), self.squash_log_std(self.log_std_head(features).float())
 
     def forward(self, observations: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """Actions on [-1, 1], (batch, action_dim)."""
@@ -256,7 +257,7 @@ class Critic(nn.Module):
         """Logits, or expected values where n_atoms is 1, (batch, n_critics, n_values, n_atoms); and what the trunk made of
         state, preference and action, (n_critics, batch, features_dim)."""
         features = self.trunk(th.cat([observations, actions], dim=-1), observations[:, self.observation_dim :])
-        return self.head(features).unflatten(-1, self.shape).transpose(0, 1), features
+        return self.head(features).float().unflatten(-1, self.shape).transpose(0, 1), features
 
     def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Logits, or expected values where n_atoms is 1: (batch, n_critics, n_values, n_atoms)."""
