@@ -12,10 +12,11 @@ from sb3_momba.pareto.callbacks import ParetoEvalCallback
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
 from sb3_momba.pareto.metrics import expected_utility, hypervolume, inverted_generational_distance, preference_regret
 from sb3_momba.pareto.plotting import plot_front
-from sb3_momba.policies import MlpPolicy, SimbaPolicy
+from sb3_momba.policies import FlashSacPolicy, MlpPolicy, SimbaPolicy, XqcPolicy
 
 __all__ = [
     "MOMBA",
+    "FlashSacPolicy",
     "MlpPolicy",
     "MombaCheckpointCallback",
     "ParetoEvalCallback",
@@ -23,6 +24,7 @@ __all__ = [
     "PreferenceReplayBuffer",
     "PreferenceWrapper",
     "SimbaPolicy",
+    "XqcPolicy",
     "check_mo_env",
     "evaluate_front",
     "expected_utility",

@@ -18,12 +18,13 @@ from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics,
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.exploration import HeldNoise
+from sb3_momba.nn.batch_norm import follow_batch_statistics, without_batch_statistics
 from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.nn.speed import keep_freed_memory, without_weight_gradients
-from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+from sb3_momba.policies import FlashSacPolicy, MlpPolicy, MombaPolicy, SimbaPolicy, XqcPolicy
 from sb3_momba.settings import (
     HER_DEFAULTS,
     check_other_arguments,
@@ -44,7 +45,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     CAPQL (Lu et al., 2023) with SimbaV2 networks (Lee et al., 2025) and distributional critics: one run learns one policy
     pi(a | s, w) for every preference w. With a scalar reward it is single-objective SimbaV2-SAC. Defaults are Table B.1's.
 
-    :param policy: "SimbaPolicy", "MlpPolicy" or a class
+    :param policy: "SimbaPolicy", "MlpPolicy", "XqcPolicy", "FlashSacPolicy" or a class
     :param env: id, environment or VecEnv; environments are put into PreferenceWrapper
     :param learning_rate: of actor, critics and entropy coefficient; a number or a function of the remaining progress
     :param buffer_size: transitions kept
@@ -78,7 +79,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param replay_buffer_class: PreferenceReplayBuffer or a subclass
     :param replay_buffer_kwargs: see PreferenceReplayBuffer; they take precedence over MOMBA's own
     :param optimize_memory_usage: SB3's switch, always off: see PreferenceReplayBuffer
-    :param policy_kwargs: see SimbaPolicy, MlpPolicy and MombaPolicy
+    :param policy_kwargs: see the policies' classes and MombaPolicy
     :param stats_window_size: episodes that the log's mean return and length are taken over
     :param tensorboard_log: folder of TensorBoard's logs; None writes none
     :param verbose: 0 prints nothing, 1 the log, 2 debugging messages too
@@ -89,7 +90,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :raises TypeError: for an argument that there is not, naming the nearest
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"SimbaPolicy": SimbaPolicy, "MlpPolicy": MlpPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        policy.__name__: policy for policy in (SimbaPolicy, MlpPolicy, XqcPolicy, FlashSacPolicy)
+    }
     policy: MombaPolicy
     actor: Actor  # type: ignore[assignment]
     critic: Critic
@@ -298,6 +301,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
         with self._rounded_products():
             critic_loss, metrics = self._critic_loss(batch, alpha)
         descend(self.critic.optimizer, critic_loss, "critic")
+        follow_batch_statistics(self.critic)
+        follow_batch_statistics(self.critic_target)
         try:
             if self._n_updates % self.policy_delay == 0:
                 metrics |= self._improve_policy(batch, alpha)
@@ -309,9 +314,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def _improve_policy(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> Metrics:
         """The steps of the actor and the entropy coefficient."""
-        with self._rounded_products(), without_weight_gradients(self.critic):
+        # Of batch norm, only the network that takes the step sees the batch: the critics judge a new action as they would alone,
+        # and their running averages stay those of the actions in the buffer.
+        with self._rounded_products(), without_weight_gradients(self.critic), without_batch_statistics(self.critic):
             actor_loss, log_prob, metrics = self._actor_loss(batch, alpha)
         descend(self.actor.optimizer, actor_loss, "actor")
+        follow_batch_statistics(self.actor)
         if self.ent_coef_optimizer is not None:
             descend(self.ent_coef_optimizer, self._alpha_loss(log_prob), "entropy coefficient")
         return metrics
@@ -344,9 +352,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
         """Eq. (3.17), or eqs. (3.2) and (3.13) by `critic_loss` and `vector_values`."""
         value = self.policy.value
         with th.no_grad():
-            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            with without_batch_statistics(self.actor):
+                next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            # Batch norm takes its statistics from both at once, so that predictions and targets are normalised alike.
+            now, next_ = (batch.observations, batch.actions), (batch.next_observations, next_actions)
             targets = value.bootstrap(
-                self.critic_target(batch.next_observations, next_actions),
+                self.critic_target(*next_, *now),
                 rewards=batch.rewards if self.vector_values else scalarise(batch.rewards, batch.preferences)[:, None],
                 discounts=batch.discounts * (1 - batch.dones),
                 bonus=-alpha * next_log_prob,
@@ -355,7 +366,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
             if self.critic_minimum == "scalarised":
                 worth = self._scalarised(worth, batch.preferences)[..., None]
             target = lowest(targets, worth)
-        outputs, features = self.critic.values_and_features(batch.observations, batch.actions)
+        outputs, features = self.critic.values_and_features(*now, *next_)
         loss = value.loss(outputs, target)
         loss = loss.sum(dim=(1, 2)).mean() if self.critic_loss_reduction == "sum" else loss.mean()
         with th.no_grad():

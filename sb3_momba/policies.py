@@ -1,4 +1,4 @@
-"""SimbaPolicy and MlpPolicy: actor, critic ensemble, target critics and running statistics in one module."""
+"""Policies: actor, critic ensemble, target critics and running statistics in one module."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -15,17 +15,19 @@ from torch import nn
 from sb3_momba.envs.preferences import preference_dim
 from sb3_momba.files import FileFormatError, FilePath, content_of, write_tree
 from sb3_momba.formats import header, read_format
+from sb3_momba.nn.flash_sac import FlashSacArchitecture
 from sb3_momba.nn.layers import project_weights
 from sb3_momba.nn.networks import Actor, Architecture, Critic, MlpArchitecture, SimbaArchitecture
 from sb3_momba.nn.normalization import ReturnScale, RunningStatistics
 from sb3_momba.nn.values import DistributionalValue, ExpectedValue
+from sb3_momba.nn.xqc import XqcArchitecture
 
 POLICY_FORMAT = "sb3_momba.policy"
 Self = TypeVar("Self", bound="MombaPolicy")
 
 
 class MombaPolicy(BasePolicy):
-    """What both policies share; a subclass chooses the architectures of actor and critic.
+    """What all policies share; a subclass chooses the architectures of actor and critic.
 
     `actor` and `critic` read normalised observations [(s - mean) / deviation, w]; `predict` and `normalize` take raw ones.
 
@@ -280,5 +282,111 @@ class MlpPolicy(MombaPolicy):
             "conditioning": conditioning,
             "ortho_init": ortho_init,
             "activation_fn": activation_fn,
+            **kwargs,
+        }
+
+
+class XqcPolicy(MombaPolicy):
+    """XQC's actor and critics (Palenicek et al., 2025): dense layers of unit norm, batch norm before each ReLU.
+
+    The sizes are the paper's; with cross-entropy and `n_atoms`, `support` as they are by default, so is the critic. While
+    training, (s, a) and (s', a') go through critic and target critic in one pass with common batch statistics. Of the
+    algorithm around it, the configuration `xqc` says what the paper has otherwise. Not the paper's: observations are
+    normalised by their running statistics before the input's batch norm, which hardly tells (`normalize_observations`).
+
+    `predict` takes [s, w], (batch, observation_dim + preference_dim), and gives actions, (batch, action_dim), in the
+    environment's bounds.
+
+    :param actor_hidden_dim: width of the actor's layers
+    :param actor_blocks: its hidden layers
+    :param critic_hidden_dim: width of a critic's layers
+    :param critic_blocks: its hidden layers
+    :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)
+    :param normalize_weights: unit-norm columns of the dense layers
+    :param kwargs: see MombaPolicy
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        actor_hidden_dim: int = 256,
+        actor_blocks: int = 4,
+        critic_hidden_dim: int = 512,
+        critic_blocks: int = 4,
+        conditioning: str = "input",
+        normalize_weights: bool = True,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            XqcArchitecture(actor_hidden_dim, actor_blocks, conditioning),
+            XqcArchitecture(critic_hidden_dim, critic_blocks, conditioning),
+            normalize_weights=normalize_weights,
+            **kwargs,
+        )
+        self.arguments = {
+            "actor_hidden_dim": actor_hidden_dim,
+            "actor_blocks": actor_blocks,
+            "critic_hidden_dim": critic_hidden_dim,
+            "critic_blocks": critic_blocks,
+            "conditioning": conditioning,
+            "normalize_weights": normalize_weights,
+            **kwargs,
+        }
+
+
+class FlashSacPolicy(MombaPolicy):
+    """FlashSAC's actor and critics (Kim et al., 2026): inverted residual blocks with batch norm, unit-norm weights.
+
+    The sizes are the paper's. While training, (s, a) and (s', a') go through critic and target critic in one pass with common
+    batch statistics; the actor takes its own from s alone, where the paper's takes them from s and s'. Of the algorithm
+    around it, the configuration `flashsac` says what the paper has otherwise. Not the paper's: observations are normalised by
+    their running statistics before the input's batch norm, which hardly tells (`normalize_observations`).
+
+    `predict` takes [s, w], (batch, observation_dim + preference_dim), and gives actions, (batch, action_dim), in the
+    environment's bounds.
+
+    :param actor_hidden_dim: width of the actor's embedding
+    :param actor_blocks: its inverted residual blocks
+    :param critic_hidden_dim: width of a critic's embedding
+    :param critic_blocks: its inverted residual blocks
+    :param conditioning: "input", "all", "film" or "film+all" (section 4.3.4)
+    :param normalize_weights: unit-norm columns of the dense layers, gains and shifts of a fixed norm
+    :param kwargs: see MombaPolicy
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        actor_hidden_dim: int = 128,
+        actor_blocks: int = 2,
+        critic_hidden_dim: int = 256,
+        critic_blocks: int = 2,
+        conditioning: str = "input",
+        normalize_weights: bool = True,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            FlashSacArchitecture(actor_hidden_dim, actor_blocks, conditioning),
+            FlashSacArchitecture(critic_hidden_dim, critic_blocks, conditioning),
+            normalize_weights=normalize_weights,
+            **kwargs,
+        )
+        self.arguments = {
+            "actor_hidden_dim": actor_hidden_dim,
+            "actor_blocks": actor_blocks,
+            "critic_hidden_dim": critic_hidden_dim,
+            "critic_blocks": critic_blocks,
+            "conditioning": conditioning,
+            "normalize_weights": normalize_weights,
             **kwargs,
         }

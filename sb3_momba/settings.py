@@ -14,7 +14,7 @@ from torch import nn
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.nn.products import PRECISIONS
 from sb3_momba.nn.speed import has_compiler
-from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+from sb3_momba.policies import FlashSacPolicy, MlpPolicy, MombaPolicy, SimbaPolicy, XqcPolicy
 
 SWITCHES = ("vector_values", "her", "preference_alignment", "compile", "deterministic_exploration", "optimize_memory_usage")
 # The least that they may be.
@@ -144,13 +144,13 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
     doubled = sorted(set(policy_kwargs) & set(INJECTED))
     if doubled:
         raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
-    if policy in (SimbaPolicy, MlpPolicy):
+    if policy in (SimbaPolicy, MlpPolicy, XqcPolicy, FlashSacPolicy):
         for name in policy_kwargs:
             if name in OF_SACS_POLICY:
                 raise ValueError(f"policy_kwargs {name}={policy_kwargs[name]!r}: {OF_SACS_POLICY[name]}.")
-            if policy is SimbaPolicy and name in ("net_arch", "activation_fn"):
+            if policy is not MlpPolicy and name in ("net_arch", "activation_fn"):
                 raise ValueError(
-                    f"policy_kwargs: SimbaPolicy has no {name}: its sizes are actor_hidden_dim, actor_blocks, "
+                    f"policy_kwargs: {policy.__name__} has no {name}: its sizes are actor_hidden_dim, actor_blocks, "
                     "critic_hidden_dim and critic_blocks. MlpPolicy has it."
                 )
         check_names("policy_kwargs", policy_kwargs, policy_parameters(policy), f"{policy.__name__} has no argument")

@@ -29,7 +29,7 @@ from sb3_momba.zoo.configuration import (
     with_defaults,
 )
 
-ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy"}
+ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy", "xqc": "XqcPolicy", "flashsac": "FlashSacPolicy"}
 
 
 def report(result: RunResult) -> str:

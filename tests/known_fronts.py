@@ -151,7 +151,7 @@ def train_and_score(task_name: str, steps: int | None, seed: int, policy: str, c
         critic_loss=critic_loss,
         vector_values=vector_values,
         ent_coef="auto_0.01",
-        policy_kwargs=SMALL_SIMBA if policy == "SimbaPolicy" else SMALL_MLP,
+        policy_kwargs=SMALL_MLP if policy == "MlpPolicy" else SMALL_SIMBA,
         seed=seed,
         **task.settings,
     )
@@ -195,7 +195,7 @@ def main() -> None:
     logging.disable(logging.WARNING)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
-    parser.add_argument("--policies", nargs="+", default=["SimbaPolicy", "MlpPolicy"])
+    parser.add_argument("--policies", nargs="+", default=["SimbaPolicy", "MlpPolicy"], choices=MOMBA.policy_aliases)
     parser.add_argument("--critic-losses", nargs="+", default=["ce", "mse"])
     parser.add_argument("--vector-values", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--steps", type=int, help="by default the task's")

@@ -74,6 +74,8 @@ VARIANTS = {
         **{"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5)), "n_envs": 3},
     },
     "held noise, a delayed actor": {"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15"},
+    "XqcPolicy, vector": {"policy": "XqcPolicy", "vector_values": True},
+    "FlashSacPolicy, HER": {"policy": "FlashSacPolicy", "her": True},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},
 }
 

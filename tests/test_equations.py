@@ -92,15 +92,18 @@ def make_batch(rewards: Any, preferences: Any, dones: Any = None, discounts: Any
 
 
 class StubCritic:
-    """Stands for a critic ensemble: `outputs(observations, actions)` is (batch, n_critics, n_values, n_outputs)."""
+    """Stands for a critic ensemble: `outputs(observations, actions)` is (batch, n_critics, n_values, n_outputs), whatever is
+    beside them."""
 
     def __init__(self, outputs: Callable[[th.Tensor, th.Tensor], th.Tensor]):
         self.outputs = outputs
 
-    def __call__(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def __call__(self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor) -> th.Tensor:
         return self.outputs(observations, actions)
 
-    def values_and_features(self, observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def values_and_features(
+        self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         return self.outputs(observations, actions), th.cat([observations, actions], dim=-1)
 
 

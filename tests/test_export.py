@@ -23,7 +23,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 EXAMPLE = Path(__file__).parent.parent / "examples" / "export_and_run.py"
 CONDITIONINGS = ["input", "all", "film", "film+all"]
 VARIANTS = [(policy, n, kind) for policy in ("SimbaPolicy", "MlpPolicy") for n in (2, 3) for kind in CONDITIONINGS]
-VARIANTS += [("SimbaPolicy", 1, "input"), ("MlpPolicy", 1, "input")]
+VARIANTS += [(policy, 1, "input") for policy in MOMBA.policy_aliases]
+VARIANTS += [("XqcPolicy", 2, "film+all"), ("FlashSacPolicy", 3, "all")]
 SUFFIXES = [".onnx", ".pt"]
 # In float32 -2.3 + (1.1 - -2.3) is more than 1.1.
 BOX = spaces.Box(np.array([-2.3, 0.1], np.float32), np.array([1.1, 7.0], np.float32))

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from sb3_momba import evaluate_front, preference_regret
+from sb3_momba import MOMBA, evaluate_front, preference_regret
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.pareto.floors import ZeroActionPolicy
 from tests.known_fronts import (
@@ -209,7 +209,7 @@ def test_standing_still_is_no_solution():
 # Three seeds of each reach 0.94 to 1.00 and 0.05 to 0.01; random actions 0.82 and 0.12, the best constant one 0.69 and 0.39.
 @pytest.mark.parametrize("vector_values", [False, True], ids=["scalarised", "vector"])
 @pytest.mark.parametrize("critic_loss", ["ce", "mse"])
-@pytest.mark.parametrize("policy", ["SimbaPolicy", "MlpPolicy"])
+@pytest.mark.parametrize("policy", MOMBA.policy_aliases)
 def test_a_short_training_comes_near_the_exact_front(policy, critic_loss, vector_values):
     share, distance = train_and_score("bandit, 2 objectives", 1_500, 1, policy, critic_loss, vector_values)
     assert share >= 0.92

@@ -22,6 +22,8 @@ VARIANTS = {
         **{"policy": "MlpPolicy", "best_return_scale": None},
         "policy_kwargs": {"activation_fn": th.nn.SiLU, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.5}},
     },
+    "XqcPolicy, film+all": {"policy": "XqcPolicy", "policy_kwargs": {"conditioning": "film+all", "normalize_weights": False}},
+    "FlashSacPolicy, vector": {"policy": "FlashSacPolicy", "vector_values": True, "policy_kwargs": {"critic_blocks": 2}},
     "CAPQL's log pi": {"policy": "MlpPolicy", "policy_kwargs": {"capql_log_prob": True, "n_critics": 3, "ortho_init": True}},
 }
 

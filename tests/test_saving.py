@@ -432,7 +432,7 @@ def test_a_missing_file_is_file_not_found(tmp_path):
 # ------------------------------------------------------------------------------------------------------ models
 
 
-@pytest.mark.parametrize("policy", ["SimbaPolicy", "MlpPolicy"])
+@pytest.mark.parametrize("policy", MOMBA.policy_aliases)
 @pytest.mark.parametrize("ent_coef", ["auto_0.2", 0.1])
 def test_a_loaded_model_has_the_same_parameters_optimisers_statistics_and_predictions(policy, ent_coef, tmp_path):
     model = tiny_model(StubEnv(), policy, ent_coef=ent_coef).learn(45)

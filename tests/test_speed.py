@@ -100,7 +100,9 @@ def test_training_mode_reaches_every_module():
         assert {module.training for module in policy.modules()} == {mode}
 
 
-@pytest.mark.parametrize(("policy", "kwargs"), [("SimbaPolicy", TINY_SIMBA), ("MlpPolicy", TINY_MLP)])
+@pytest.mark.parametrize(
+    ("policy", "kwargs"), [(policy, TINY_MLP if policy == "MlpPolicy" else TINY_SIMBA) for policy in MOMBA.policy_aliases]
+)
 def test_the_actor_loss_asks_for_no_gradients_of_the_critics_weights(policy, kwargs):
     model = filled_model(policy, policy_kwargs=kwargs)
     batch = model._sample(32)

@@ -16,10 +16,17 @@ from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler
 from sb3_momba.nn.layers import Film, HyperDense
 from sb3_momba.nn.networks import CONDITIONINGS
 from sb3_momba.train import main, parse
-from sb3_momba.zoo.configuration import SHIPPED, check_hyperparameters, read_configuration, shipped_configurations
+from sb3_momba.zoo.configuration import (
+    SHIPPED,
+    check_hyperparameters,
+    read_configuration,
+    shipped_configurations,
+    with_schedules,
+)
 from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv
 
-POLICIES = {"SimbaPolicy": TINY_SIMBA, "MlpPolicy": TINY_MLP}
+POLICIES = {"SimbaPolicy": TINY_SIMBA, "MlpPolicy": TINY_MLP, "FlashSacPolicy": TINY_SIMBA}
+POLICIES["XqcPolicy"] = {**TINY_SIMBA, "actor_blocks": 2, "critic_blocks": 2}  # the first reads the input
 
 
 def model_of(policy: str = "SimbaPolicy", **policy_kwargs) -> MOMBA:
@@ -237,7 +244,7 @@ def test_deterministic_exploration_collects_the_mean_action() -> None:
 def test_shipped_configurations_build_models(name: str) -> None:
     configuration = read_configuration(name, "StubEnv-v0")
     assert configuration.n_timesteps == 1_000_000
-    hyperparameters = {**configuration.hyperparameters, "buffer_size": 10}
+    hyperparameters = with_schedules({**configuration.hyperparameters, "buffer_size": 10})
     model = MOMBA(configuration.policy, StubEnv(), device="cpu", **hyperparameters)
     assert model.policy_kwargs == configuration.hyperparameters.get("policy_kwargs", {})
 

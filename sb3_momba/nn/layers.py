@@ -60,7 +60,14 @@ def orthogonal_members_(weight: nn.Parameter) -> None:
         nn.init.orthogonal_(matrix.T)
 
 
-class HyperDense(nn.Module):
+class Projected(nn.Module):
+    """A layer whose parameters lie on hyperspheres, and are put back there after every step (Algorithm 1)."""
+
+    def project(self) -> None:
+        raise NotImplementedError
+
+
+class HyperDense(Projected):
     """x W without bias, whose columns, one per output unit, `project` puts on the unit hypersphere (weight normalisation,
     section 3.3)."""
 
@@ -150,6 +157,18 @@ class HyperHead(nn.Module):
         return self.dense2(self.scaler(self.dense1(x))) + (self.bias if self.bias.dim() == 1 else self.bias.unsqueeze(1))
 
 
+class UnitHead(nn.Module):
+    """Output prediction by one dense layer with unit-norm columns, and a bias."""
+
+    def __init__(self, hidden_dim: int, out_features: int, n_members: int | None = None):
+        super().__init__()
+        self.dense = HyperDense(hidden_dim, out_features, n_members)
+        self.bias = nn.Parameter(th.zeros(*member_shape(n_members), out_features))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return dense(x, self.dense.weight, self.bias)
+
+
 class Linear(nn.Module):
     """torch's Linear, its initialisation included, for one network or an ensemble."""
 
@@ -187,7 +206,7 @@ class Film(nn.Module):
 
 
 def project_weights(network: nn.Module) -> None:
-    """Put the weights of every SimbaV2 dense layer of a network back on the unit hypersphere (Algorithm 1)."""
+    """Put the weights of every projected layer of a network back on their hyperspheres (Algorithm 1)."""
     for module in network.modules():
-        if isinstance(module, HyperDense):
+        if isinstance(module, Projected):
             module.project()

@@ -1,4 +1,4 @@
-"""Preference-conditioned actor and critic ensemble on one of two trunks.
+"""Preference-conditioned actor and critic ensemble on a trunk: SimbaV2's and the dense one are here.
 
 A trunk turns (batch, inputs) into features (batch, trunk.features_dim), or (n_members, batch, features_dim) in an
 ensemble. The preference is part of its input; `conditioning` (section 4.3.4) says where it comes in besides:
@@ -38,9 +38,13 @@ class Architecture(Protocol):
 
 
 class Trunk(nn.Module):
-    """The common part of both trunks: where the preference enters."""
+    """The common part of all trunks: where the preference enters.
+
+    `shares_batches`: rows of a batch see each other while training, so that what is compared goes through together.
+    """
 
     features_dim: int
+    shares_batches = False
 
     def __init__(self, preference_dim: int, conditioning: str):
         super().__init__()
@@ -138,7 +142,7 @@ class SimbaArchitecture:
         return HyperHead(features_dim, output_dim, n_members)
 
     def log_std(self, raw: th.Tensor) -> th.Tensor:
-        return SIMBA_LOG_STD_MIN + 0.5 * (SIMBA_LOG_STD_MAX - SIMBA_LOG_STD_MIN) * (1 + th.tanh(raw))
+        return squash_log_std(raw)
 
 
 class MlpArchitecture:
@@ -161,6 +165,11 @@ class MlpArchitecture:
 
     def log_std(self, raw: th.Tensor) -> th.Tensor:
         return th.clamp(raw, SAC_LOG_STD_MIN, SAC_LOG_STD_MAX)
+
+
+def squash_log_std(raw: th.Tensor) -> th.Tensor:
+    """-10 + 6 (1 + tanh(.)): SimbaV2's, in [-10, 2]."""
+    return SIMBA_LOG_STD_MIN + 0.5 * (SIMBA_LOG_STD_MAX - SIMBA_LOG_STD_MIN) * (1 + th.tanh(raw))
 
 
 class Actor(nn.Module):
@@ -253,12 +262,24 @@ class Critic(nn.Module):
         self.head = architecture.head(self.trunk.features_dim, n_values * n_atoms, n_critics)
 
     @compilable
-    def values_and_features(self, observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def values_and_features(
+        self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Logits, or expected values where n_atoms is 1, (batch, n_critics, n_values, n_atoms); and what the trunk made of
-        state, preference and action, (n_critics, batch, features_dim)."""
+        state, preference and action, (n_critics, batch, features_dim).
+
+        :param beside: observations and actions that join the batch whose statistics batch norm takes; without batch norm they
+            are not even looked at
+        """
+        n = len(actions)
+        joint = self.trunk.shares_batches and len(beside) > 0
+        if joint:
+            observations, actions = th.cat([observations, beside[0]]), th.cat([actions, beside[1]])
         features = self.trunk(th.cat([observations, actions], dim=-1), observations[:, self.observation_dim :])
+        if joint:
+            features = features[:, :n]
         return self.head(features).float().unflatten(-1, self.shape).transpose(0, 1), features
 
-    def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def forward(self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor) -> th.Tensor:
         """Logits, or expected values where n_atoms is 1: (batch, n_critics, n_values, n_atoms)."""
-        return self.values_and_features(observations, actions)[0]
+        return self.values_and_features(observations, actions, *beside)[0]
