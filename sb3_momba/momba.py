@@ -314,8 +314,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def _improve_policy(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> Metrics:
         """The steps of the actor and the entropy coefficient."""
-        # Of batch norm, only the network that takes the step sees the batch: the critics judge a new action as they would alone,
-        # and their running averages stay those of the actions in the buffer.
+        # Of batch norm, only the network that takes the step sees the batch: the critics judge a new action as they would
+        # alone, and their running averages stay those of the actions in the buffer.
         with self._rounded_products(), without_weight_gradients(self.critic), without_batch_statistics(self.critic):
             actor_loss, log_prob, metrics = self._actor_loss(batch, alpha)
         descend(self.actor.optimizer, actor_loss, "actor")

@@ -55,6 +55,8 @@ def test_learning_rates_that_fall_linearly() -> None:
     schedule = with_schedules({"learning_rate": "lin_3e-4"})["learning_rate"]
     assert isinstance(schedule, LinearSchedule)
     assert [schedule(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([3e-4, 1.5e-4, 0])
+    to_a_tenth = with_schedules({"learning_rate": "lin_3e-4_3e-5"})["learning_rate"]
+    assert [to_a_tenth(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([3e-4, 1.65e-4, 3e-5])
     assert with_schedules({"learning_rate": 1e-3}) == {"learning_rate": 1e-3}
     for bad in ("linear_3e-4", "lin_-1", "lin_nan"):
         with pytest.raises(ValueError, match=f"learning_rate='{bad}': give a number of at least 0, or lin_3e-4"):
@@ -67,7 +69,7 @@ def test_only_numbers_with_an_exponent_are_read_from_strings() -> None:
     assert read == {"a": 1e-3, "b": 1_000_000, "c": "007", "d": "nan", "e": [250, "x"], "f": "3"}
 
 
-@pytest.mark.parametrize("rate", ["3e4", "lin_inf", "lin_nan", "lin_-1", "linear", "lin_"])
+@pytest.mark.parametrize("rate", ["3e4", "lin_inf", "lin_nan", "lin_-1", "linear", "lin_", "lin_1e-3_x", "lin__1e-3"])
 def test_learning_rates_that_cannot_be_are_named(rate: str) -> None:
     with pytest.raises(ValueError, match=f"learning_rate='{rate}': give a number of at least 0, or lin_3e-4"):
         with_schedules({"learning_rate": rate})
