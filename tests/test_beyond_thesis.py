@@ -9,7 +9,6 @@ import torch as th
 from sb3_momba import MOMBA
 from sb3_momba.exploration import HeldNoise
 from sb3_momba.settings import parse_target_entropy
-from sb3_momba.zoo.configuration import with_schedules
 from tests.stubs import StubEnv, tiny_model
 
 
@@ -144,16 +143,6 @@ def test_several_relabels_of_each_transition():
 def test_wrong_numbers_of_relabels_are_named(n_relabels, said):
     with pytest.raises(ValueError, match=rf"n_relabels={n_relabels}.*{said}"):
         tiny_model(StubEnv(), her=True, her_kwargs={"n_relabels": n_relabels}, batch_size=8)
-
-
-# ------------------------------------------------------------------------------------------------------- schedules
-
-
-def test_a_learning_rate_that_falls_to_another():
-    rate = with_schedules({"learning_rate": "lin_3e-4_1e-4"})["learning_rate"]
-    assert [rate(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([3e-4, 2e-4, 1e-4])
-    with pytest.raises(ValueError, match="lin_3e-4_1e-4"):
-        with_schedules({"learning_rate": "lin_3e-4_x"})
 
 
 # -------------------------------------------------------------------------------------------------------- all of it

@@ -136,7 +136,8 @@ def with_schedules(hyperparameters: dict[str, Any]) -> dict[str, Any]:
     start, end = number_in(first), number_in(last or "0")
     if not rate.startswith(LINEAR) or start is None or end is None:
         raise ValueError(
-            f"learning_rate={rate!r}: give a number of at least 0, {LINEAR}3e-4 to fall from it to 0, or {LINEAR}3e-4_1e-4."
+            f"learning_rate={rate!r}: give a number of at least 0, or {LINEAR}3e-4 to fall from it to 0, {LINEAR}3e-4_1e-4 to "
+            "fall to 1e-4."
         )
     return {**hyperparameters, "learning_rate": LinearSchedule(start, end, 1.0)}
 
