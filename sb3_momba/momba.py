@@ -63,6 +63,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0, n_relabels=1)`: see PreferenceReplayBuffer
     :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
+    :param return_scaling: "maximum": by the largest return alone; "deviation": by the returns' standard deviation, down to what
+        keeps the largest at best_return_scale (SimbaV2's code; FlashSAC)
     :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
     :param target_entropy: of the policy on [-1, 1], in nats; "auto": `-|A|`; "std_0.15": that of a Gaussian with this standard
         deviation in each dimension (FlashSAC)
@@ -118,6 +120,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         her_kwargs: dict[str, Any] | None = None,
         preference_alignment: bool = False,
         best_return_scale: float | None = 3.0,
+        return_scaling: str = "maximum",
         ent_coef: str | float = "auto_0.2",
         target_entropy: str | float = "auto",
         ent_coef_learning_rate: float | None = None,
@@ -181,6 +184,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self.critic_loss_reduction = critic_loss_reduction
         self.deterministic_exploration = deterministic_exploration
         self.best_return_scale = best_return_scale
+        self.return_scaling = return_scaling
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.ent_coef_learning_rate = ent_coef_learning_rate
@@ -237,6 +241,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
             "critic_loss": self.critic_loss,
             "vector_values": self.vector_values,
             "best_return_scale": self.best_return_scale,
+            "return_scaling": self.return_scaling,
             "gamma": self.gamma,
         }
 

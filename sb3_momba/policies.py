@@ -18,7 +18,7 @@ from sb3_momba.formats import header, read_format
 from sb3_momba.nn.flash_sac import FlashSacArchitecture
 from sb3_momba.nn.layers import project_weights
 from sb3_momba.nn.networks import Actor, Architecture, Critic, MlpArchitecture, SimbaArchitecture
-from sb3_momba.nn.normalization import ReturnScale, RunningStatistics
+from sb3_momba.nn.normalization import DeviationScale, ReturnScale, RunningStatistics
 from sb3_momba.nn.values import DistributionalValue, ExpectedValue
 from sb3_momba.nn.xqc import XqcArchitecture
 
@@ -36,10 +36,11 @@ class MombaPolicy(BasePolicy):
     :param lr_schedule: learning rate as a function of the remaining progress, 1 at the start
     :param actor_architecture: builds the actor's layers
     :param critic_architecture: builds the layers of each critic
-    :param n_objectives: injected by MOMBA, like the next four; see there
+    :param n_objectives: injected by MOMBA, like the next five; see there
     :param critic_loss: "ce" or "mse"
     :param vector_values: critics of the vector return
     :param best_return_scale: what the largest return seen is scaled to
+    :param return_scaling: "maximum" or "deviation"
     :param gamma: discount of the returns that are scaled
     :param n_critics: size of the ensemble
     :param n_atoms: atoms of a return distribution (critic_loss="ce")
@@ -67,6 +68,7 @@ class MombaPolicy(BasePolicy):
         critic_loss: str = "ce",
         vector_values: bool = False,
         best_return_scale: float | None = 3.0,
+        return_scaling: str = "maximum",
         gamma: float = 0.99,
         n_critics: int = 2,
         n_atoms: int = 101,
@@ -91,7 +93,10 @@ class MombaPolicy(BasePolicy):
         self.normalize_weights = normalize_weights
 
         self.statistics = RunningStatistics(self.observation_dim)
-        self.return_scale = ReturnScale(best_return_scale, gamma)
+        if return_scaling == "deviation" and best_return_scale is not None:
+            self.return_scale: ReturnScale = DeviationScale(best_return_scale, gamma, n_objectives)
+        else:
+            self.return_scale = ReturnScale(best_return_scale, gamma)
         self.value = DistributionalValue(*support, n_atoms) if critic_loss == "ce" else ExpectedValue()
         action_dim = int(action_space.shape[0])
         half_width = th.as_tensor((action_space.high - action_space.low) / 2, dtype=th.float32)

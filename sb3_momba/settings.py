@@ -25,13 +25,14 @@ CHOICES = {
     "critic_minimum": ("scalarised", "objective"),
     "critic_loss_reduction": ("sum", "mean"),
     "precision": PRECISIONS,
+    "return_scaling": ("maximum", "deviation"),
 }
 BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "n_relabels", "seed", "handle_timeout_termination")
 HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1}
 
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
 POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")
-INJECTED = ("n_objectives", "critic_loss", "vector_values", "best_return_scale", "gamma")
+INJECTED = ("n_objectives", "critic_loss", "vector_values", "best_return_scale", "return_scaling", "gamma")
 NOT_FOR_USERS = {
     *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
     *INJECTED,
@@ -91,6 +92,8 @@ def check_settings(model: Any) -> None:
         raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or a function of the remaining progress.")
     if scale is not None and not (is_number(scale) and scale > 0):
         raise ValueError(f"best_return_scale={scale!r}: give a number above 0, or None to leave rewards as they are.")
+    if scale is None and settings["return_scaling"] == "deviation":
+        raise ValueError("return_scaling='deviation' with best_return_scale=None: the latter leaves rewards as they are.")
     noise = settings["action_noise"]
     if noise is not None and not isinstance(noise, ActionNoise):
         raise ValueError(f"action_noise={noise!r}: give an ActionNoise of stable_baselines3.common.noise, or None.")

@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_momba import MOMBA
 from sb3_momba.exploration import HeldNoise
+from sb3_momba.nn.normalization import DeviationScale
 from sb3_momba.settings import parse_target_entropy
 from tests.stubs import StubEnv, tiny_model
 
@@ -143,6 +144,37 @@ def test_several_relabels_of_each_transition():
 def test_wrong_numbers_of_relabels_are_named(n_relabels, said):
     with pytest.raises(ValueError, match=rf"n_relabels={n_relabels}.*{said}"):
         tiny_model(StubEnv(), her=True, her_kwargs={"n_relabels": n_relabels}, batch_size=8)
+
+
+# ---------------------------------------------------------------------------------------------------- return scaling
+
+
+def test_rewards_are_divided_by_the_largest_deviation_or_by_what_keeps_the_maximum_within_bounds():
+    """gamma = 0.5. Rewards (4, 1), (0, 1), (0, 1): G is (4, 1), (2, 1.5), (1, 1.75). Its first part has the variance 14/9
+    and the maximum 4."""
+    scale = DeviationScale(5.0, 0.5, 2)
+    assert scale.factor == 1
+    for reward in ([4.0, 1.0], [0.0, 1.0], [0.0, 1.0]):
+        scale.update(np.array([reward]), np.array([False]))
+    assert 4 / 5 < (14 / 9) ** 0.5
+    assert scale.factor == pytest.approx((9 / 14) ** 0.5)
+    tight = DeviationScale(2.0, 0.5, 2)
+    for reward in ([4.0, 1.0], [0.0, 1.0], [0.0, 1.0]):
+        tight.update(np.array([reward]), np.array([False]))
+    assert tight.factor == pytest.approx(2 / 4)
+
+
+def test_the_deviation_scales_a_training_and_is_saved(tmp_path):
+    model = tiny_model(StubEnv(), return_scaling="deviation", best_return_scale=5.0).learn(60)
+    scale = model.policy.return_scale
+    assert isinstance(scale, DeviationScale)
+    assert float(scale.statistics.count) == 60
+    model.save(tmp_path / "model")
+    assert MOMBA.load(tmp_path / "model").policy.return_scale.factor == scale.factor != 1
+    with pytest.raises(ValueError, match="return_scaling='deviation' with best_return_scale=None"):
+        tiny_model(StubEnv(), return_scaling="deviation", best_return_scale=None)
+    with pytest.raises(ValueError, match="return_scaling='mean' is not known"):
+        tiny_model(StubEnv(), return_scaling="mean")
 
 
 # -------------------------------------------------------------------------------------------------------- all of it

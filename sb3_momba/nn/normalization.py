@@ -80,8 +80,12 @@ class ReturnScale(nn.Module):
         if self.running_returns is None or self.running_returns.shape != rewards.shape:
             self.running_returns = np.zeros(rewards.shape, dtype=np.float64)
         self.running_returns = self.gamma * self.running_returns + rewards
-        self.max_return.fill_(max(float(self.max_return), float(np.abs(self.running_returns).max())))
+        self.observe(self.running_returns)
         self.running_returns[dones.astype(bool)] = 0.0
+
+    def observe(self, returns: np.ndarray) -> None:
+        """:param returns: G of every environment at this step, (n_envs, n_objectives)"""
+        self.max_return.fill_(max(float(self.max_return), float(np.abs(returns).max())))
 
     def end_episodes(self, indices: Sequence[int] | None = None) -> None:
         """The next rewards begin new returns, in any number of environments.
@@ -100,3 +104,26 @@ class ReturnScale(nn.Module):
         if self.best_return_scale is None or largest < SMALLEST_RETURN:
             return 1.0
         return self.best_return_scale / largest
+
+
+class DeviationScale(ReturnScale):
+    """Rewards are divided by the largest standard deviation of any objective's running return, or by max |G_i| /
+    best_return_scale where that is larger, which keeps returns within the support (SimbaV2's code; FlashSAC).
+
+    :param n_objectives: width of the rewards
+    """
+
+    def __init__(self, best_return_scale: float, gamma: float, n_objectives: int):
+        super().__init__(best_return_scale, gamma)
+        self.statistics = RunningStatistics(n_objectives)
+
+    def observe(self, returns: np.ndarray) -> None:
+        super().observe(returns)
+        self.statistics.update(returns)
+
+    @property
+    def factor(self) -> float:
+        """What a reward is multiplied by; 1 while no return is above 1e-8."""
+        if float(self.max_return) < SMALLEST_RETURN:
+            return 1.0
+        return min(super().factor, 1 / float(self.statistics.variance.max().sqrt()))
