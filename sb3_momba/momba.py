@@ -21,6 +21,7 @@ from sb3_momba.exploration import HeldNoise
 from sb3_momba.nn.batch_norm import follow_batch_statistics, without_batch_statistics
 from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest
+from sb3_momba.nn.layers import in_float32
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.nn.speed import keep_freed_memory, without_weight_gradients
@@ -379,7 +380,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
                 "critic_loss": loss.detach(),
                 "q": value.mean(outputs).mean(dim=(0, 1)),
                 "target_end_mass": value.end_mass(target).mean(),
-                "feature_norm": th.linalg.vector_norm(features, dim=-1, dtype=th.float32).mean(),
+                "feature_norm": th.linalg.vector_norm(in_float32(features), dim=-1).mean(),
             }
         return loss, metrics
 

@@ -294,10 +294,10 @@ class MlpPolicy(MombaPolicy):
 class XqcPolicy(MombaPolicy):
     """XQC's actor and critics (Palenicek et al., 2025): dense layers of unit norm, batch norm before each ReLU.
 
-    The sizes are the paper's; with cross-entropy and `n_atoms`, `support` as they are by default, so is the critic. While
-    training, (s, a) and (s', a') go through critic and target critic in one pass with common batch statistics. Of the
-    algorithm around it, the configuration `xqc` says what the paper has otherwise. Not the paper's: observations are
-    normalised by their running statistics before the input's batch norm, which hardly tells (`normalize_observations`).
+    The sizes are those of the authors' code, and so are `critic_loss`, `n_atoms` and `support` by default. While training,
+    (s, a) and (s', a') go through critics and target critics in one pass with common batch statistics. What the algorithm
+    around them has otherwise, the configuration `xqc` says. Not theirs: observations are normalised by their running
+    statistics too, which the input's batch norm undoes but for its eps, 1e-3, which then means the same in every unit.
 
     `predict` takes [s, w], (batch, observation_dim + preference_dim), and gives actions, (batch, action_dim), in the
     environment's bounds.
@@ -347,10 +347,11 @@ class XqcPolicy(MombaPolicy):
 class FlashSacPolicy(MombaPolicy):
     """FlashSAC's actor and critics (Kim et al., 2026): inverted residual blocks with batch norm, unit-norm weights.
 
-    The sizes are the paper's. While training, (s, a) and (s', a') go through critic and target critic in one pass with common
-    batch statistics; the actor takes its own from s alone, where the paper's takes them from s and s'. Of the algorithm
-    around it, the configuration `flashsac` says what the paper has otherwise. Not the paper's: observations are normalised by
-    their running statistics before the input's batch norm, which hardly tells (`normalize_observations`).
+    The sizes are those of the authors' code, and so are `critic_loss`, `n_atoms` and `support` by default. While training,
+    (s, a) and (s', a') go through critics and target critics in one pass with common batch statistics (the paper's cross-batch
+    value prediction). What the algorithm around them has otherwise, the configuration `flashsac` says. Not theirs: the actor's
+    statistics come from s alone instead of s and s'; running variances divide by n, not n - 1; observations are normalised by
+    their running statistics too, which the input's batch norm undoes but for its eps.
 
     `predict` takes [s, w], (batch, observation_dim + preference_dim), and gives actions, (batch, action_dim), in the
     environment's bounds.

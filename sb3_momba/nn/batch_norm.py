@@ -14,6 +14,8 @@ from collections.abc import Iterator
 import torch as th
 from torch import nn
 
+from sb3_momba.nn.layers import in_float32
+
 MOMENTUM = 0.01  # of the running averages, of XQC and FlashSAC alike
 
 
@@ -41,7 +43,7 @@ class BatchNorm(nn.Module):
         self.register_buffer("batch_variance", th.ones(shape), persistent=False)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        x = x.float()  # products may have been rounded
+        x = in_float32(x)
         if not self.training:
             return self.scaled(x - self.running_mean, self.running_variance)
         members = x.dim() == 3

@@ -35,6 +35,11 @@ def identity(x: th.Tensor) -> th.Tensor:
     return x
 
 
+def in_float32(x: th.Tensor) -> th.Tensor:
+    """A product that was rounded to bfloat16, for what must not be; everything else as it is."""
+    return x.float() if x.dtype == th.bfloat16 else x
+
+
 def member_shape(n_members: int | None) -> tuple[int, ...]:
     """The leading dimensions of a parameter: none, or one for the members of an ensemble."""
     return () if n_members is None else (n_members,)

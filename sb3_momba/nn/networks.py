@@ -15,7 +15,17 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_momba.nn.layers import Film, HyperEmbedder, HyperHead, HyperLerpBlock, Linear, identity, l2_normalize, orthogonal_
+from sb3_momba.nn.layers import (
+    Film,
+    HyperEmbedder,
+    HyperHead,
+    HyperLerpBlock,
+    Linear,
+    identity,
+    in_float32,
+    l2_normalize,
+    orthogonal_,
+)
 from sb3_momba.nn.speed import compilable
 
 CONDITIONINGS = ("input", "all", "film", "film+all")
@@ -204,8 +214,7 @@ class Actor(nn.Module):
     def distribution(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before tanh, each (batch, action_dim)."""
         features = self.trunk(observations, observations[:, self.observation_dim :])
-        # A product with its bias comes rounded; what follows from it is float32.
-        return self.mean_head(features).float(), self.squash_log_std(self.log_std_head(features).float())
+        return in_float32(self.mean_head(features)), self.squash_log_std(in_float32(self.log_std_head(features)))
 
     def forward(self, observations: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """Actions on [-1, 1], (batch, action_dim)."""
@@ -278,7 +287,7 @@ class Critic(nn.Module):
         features = self.trunk(th.cat([observations, actions], dim=-1), observations[:, self.observation_dim :])
         if joint:
             features = features[:, :n]
-        return self.head(features).float().unflatten(-1, self.shape).transpose(0, 1), features
+        return in_float32(self.head(features)).unflatten(-1, self.shape).transpose(0, 1), features
 
     def forward(self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor) -> th.Tensor:
         """Logits, or expected values where n_atoms is 1: (batch, n_critics, n_values, n_atoms)."""
