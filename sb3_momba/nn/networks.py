@@ -287,7 +287,7 @@ class Critic(nn.Module):
         features = self.trunk(th.cat([observations, actions], dim=-1), observations[:, self.observation_dim :])
         if joint:
             features = features[:, :n]
-        return in_float32(self.head(features)).unflatten(-1, self.shape).transpose(0, 1), features  # type: ignore[no-untyped-call]
+        return in_float32(self.head(features).unflatten(-1, self.shape).transpose(0, 1)), features
 
     def forward(self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor) -> th.Tensor:
         """Logits, or expected values where n_atoms is 1: (batch, n_critics, n_values, n_atoms)."""
