@@ -1,7 +1,7 @@
 """Writing a training into a checkpoint, and going on from one."""
 
 import os
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv
@@ -17,18 +17,15 @@ from sb3_momba.checkpoints.training_state import (
     statistics_of,
 )
 from sb3_momba.files import FileFormatError, content_of, read_tree
-
-if TYPE_CHECKING:
-    from sb3_momba.acting import PreferenceConditionedAlgorithm
+from sb3_momba.saving import PickleFreeSaving
 
 MODEL, STATE = "model.zip", "state.zip"
 
-Model = TypeVar("Model", bound="PreferenceConditionedAlgorithm")
+Model = TypeVar("Model", bound=PickleFreeSaving)
 
 
-def write_checkpoint(model: "PreferenceConditionedAlgorithm", writer: CheckpointWriter) -> None:
+def write_checkpoint(model: Any, writer: CheckpointWriter) -> None:
     """Between two rollouts, when the last transition is stored and its updates are made."""
-    assert model.env is not None
     segments, buffer = write_segments(model.replay_buffer, writer)
     state = {
         "random": random_states(model),
@@ -48,14 +45,14 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
     missing = [file for file in (MODEL, STATE) if file not in checkpoint.files]
     if missing:
         raise FileFormatError(f"{checkpoint.folder} is not a whole checkpoint: it has no {missing[0]}.")
-    model = cls.load(checkpoint.folder / MODEL, env, force_reset=False, **kwargs)
+    model: Any = cls.load(checkpoint.folder / MODEL, env, force_reset=False, **kwargs)
     state, _ = read_tree(checkpoint.folder / STATE)
     with content_of(checkpoint.folder):
         episodes = state["environments"]
         if episodes is not None and len(episodes) != model.n_envs:
             raise FileFormatError(f"{checkpoint.folder} has {len(episodes)} environments, not {model.n_envs}: give as many.")
         environments.check(episodes, model.n_objectives, model.action_space)
-        last: Any = model._last_obs
+        last = model._last_obs
         if np.shape(last) != (model.n_envs, *(model.observation_space.shape or ())):
             raise FileFormatError(f"{checkpoint.folder / MODEL} has last observations of shape {np.shape(last)}.")
         read_segments(model.replay_buffer, checkpoint, state["buffer"])
@@ -65,13 +62,11 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
         set_random_states(model, state["random"])
         model._states_of_callbacks = dict(state["callbacks"])
     model._resumed_from = checkpoint, model.replay_buffer
-    return model
+    return model  # type: ignore[no-any-return]
 
 
-def _bring_back_environments(model: "PreferenceConditionedAlgorithm", episodes: list[dict[str, Any]] | None) -> None:
-    assert model.env is not None
-    assert model._last_obs is not None
-    model._last_obs, lost = environments.bring_back(model.env, episodes, model._last_obs)  # type: ignore[arg-type]
+def _bring_back_environments(model: Any, episodes: list[dict[str, Any]] | None) -> None:
+    model._last_obs, lost = environments.bring_back(model.env, episodes, model._last_obs)
     if lost:
         model.replay_buffer.end_episodes(lost)
         model.policy.return_scale.end_episodes(lost)
