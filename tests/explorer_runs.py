@@ -4,6 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,9 @@ import numpy as np
 import pytest
 
 from sb3_momba.envs.preferences import simplex_lattice
+from sb3_momba.explorer.__main__ import main
+from sb3_momba.explorer.kit import DecisionKit
+from sb3_momba.explorer.live import LiveServer, listen
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.records import RecordWriter
@@ -125,3 +131,22 @@ def train_tiny(folder: Path) -> Path:
     )
     run(settings)
     return folder
+
+
+def fail(arguments: list[Any], words: str) -> None:
+    """The explorer's command ends with an error of these words."""
+    with pytest.raises(SystemExit, match=words):
+        main([str(one) for one in arguments])
+
+
+@contextmanager
+def serving(kit: DecisionKit) -> Iterator[LiveServer]:
+    """The live page's server, for as long as a test needs it, also one that fails."""
+    with LiveServer(kit, listen("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()

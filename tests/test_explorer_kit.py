@@ -1,0 +1,240 @@
+"""The decision kit: critics by hand, what it answers about a real run, and what it refuses."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from sb3_momba import MOMBA
+from sb3_momba.envs.wrappers import make_env
+from sb3_momba.explorer.kit import DecisionKit
+from sb3_momba.explorer.opening import open_kit, write_calibration
+from sb3_momba.explorer.prediction import CRITIC, FRONT, predictors_of, share_close
+from sb3_momba.explorer.reading import final_front, read_run
+from sb3_momba.explorer.rendering import Policy
+from sb3_momba.explorer.rollouts import Rollouts, critic_returns, entropy_bonus, roll_out
+from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
+from sb3_momba.records import read_record
+from tests.explorer_runs import TINY, fail, train_tiny, write_run
+
+
+@pytest.fixture(scope="module")
+def vector_model(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("vector") / "model.zip"
+    options: dict[str, Any] = {"vector_values": True, "ent_coef": 0.1, "policy_kwargs": TINY, "buffer_size": 10, "seed": 0}
+    model = MOMBA("MlpPolicy", "MO-Hopper-v4", **options)
+    model.policy.return_scale.max_return.fill_(30.0)  # rewards are multiplied by 3 / 30
+    model.save(path)
+    return path
+
+
+def test_rollouts_are_those_of_the_evaluation(vector_model):
+    preferences = np.array([[0.25, 0.75], [1.0, 0.0]])
+    front = evaluate_front(MOMBA.load(vector_model), "MO-Hopper-v4", preferences=preferences, n_episodes=2, seed=3)
+    rollouts = roll_out(Policy(vector_model, "MO-Hopper-v4", {}), preferences, 2, 3)
+    for name in ("returns", "discounted_returns", "episode_lengths"):
+        np.testing.assert_array_equal(getattr(rollouts.front, name), getattr(front, name))
+    n = front.returns.shape[1]
+    env = make_env("MO-Hopper-v4")
+    expected = [env.reset(seed=3 + episode)[0] for episode in range(n)]
+    np.testing.assert_array_equal(rollouts.starts, np.array(expected, dtype=np.float32))
+    assert rollouts.behaviour.shape == (2, 2 * (env.observation_space.shape[0] + env.action_space.shape[0]))
+
+
+def test_the_entropy_bonus_by_hand(vector_model):
+    """gamma H_1 + gamma^2 H_2, and behind a time limit gamma^3 / (1 - gamma) of the mean entropy; alpha 0.1, scale 0.1."""
+    model = MOMBA.load(vector_model)
+    model.actor.action_log_prob = lambda s: (None, -model.policy.return_scale.max_return.new_tensor([5.0, 1.0, 3.0]))
+    observations, w = np.zeros((3, model.policy.observation_dim), dtype=np.float32), np.array([0.5, 0.5], dtype=np.float32)
+    alone = 0.99 * 1 + 0.99**2 * 3
+    assert entropy_bonus(model, observations, w, False) == pytest.approx(0.1 * alone / 0.1)
+    assert entropy_bonus(model, observations, w, True) == pytest.approx(0.1 * (alone + 0.99**3 / 0.01 * 3) / 0.1, rel=1e-5)
+
+
+def test_a_critics_returns_are_unscaled_and_less_the_bonus(vector_model):
+    """The mean over critics and starts of (1, 3) and (2, 4), divided by the scale 0.1."""
+    model = MOMBA.load(vector_model)
+    values = model.policy.return_scale.max_return.new_tensor([[[1.0, 2.0], [3.0, 4.0]]])
+    model.policy.value.mean = lambda _: values.expand(4, 2, 2)
+    starts = np.zeros((2, model.policy.observation_dim), dtype=np.float32)
+    found = critic_returns(model, starts, np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(found, [[19.0, 29.0], [18.0, 28.0]])
+
+
+def test_the_predictor_with_the_smaller_error_is_used(vector_model):
+    model = MOMBA.load(vector_model)
+    preferences = np.stack([np.linspace(0, 1, 5), np.linspace(1, 0, 5)], axis=1)
+    starts = np.zeros((1, model.policy.observation_dim), dtype=np.float32)
+    expected = critic_returns(model, starts, preferences, np.full(5, 7.0))[:, None]
+    noise = np.array([[0.0], [9.0], [-9.0], [9.0], [0.0]])[:, None]
+    for returns, first in ((expected, CRITIC), (preferences[:, None] * 100, FRONT)):
+        front = ParetoFront(preferences, returns, returns, np.ones((5, 1), dtype=np.int64))
+        surveyed = Rollouts(front, np.zeros((5, 2)), np.full(5, 7.0), starts)
+        assert predictors_of(model, surveyed, front)[0].name == first
+    noisy = ParetoFront(preferences, expected + noise, expected + noise, np.ones((5, 1), dtype=np.int64))
+    one = predictors_of(model, surveyed, noisy)[0]
+    assert one.name == CRITIC
+    np.testing.assert_allclose(one.errors, -np.broadcast_to(noise[:, 0], (5, 2)), atol=1e-4)
+    assert one.size(np.array([1.0, 3.0])) == pytest.approx(np.sqrt((3 * 81 + 3 * 9) / 10), rel=1e-4)
+    assert one.size(np.array([0.0, 1.0])) == pytest.approx(np.sqrt(3 * 81 / 5), rel=1e-4)  # in its own unit then
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    return train_tiny(tmp_path_factory.mktemp("live") / "run")
+
+
+@pytest.fixture(scope="module")
+def kit(run_folder, tmp_path_factory) -> Iterator[DecisionKit]:
+    with open_kit(run_folder, seeds=[run_folder], folder=tmp_path_factory.mktemp("kept")) as kit:
+        yield kit
+
+
+def test_the_final_front_is_the_records(run_folder):
+    record, saved = final_front(read_record(run_folder / "record.jsonl")), ParetoFront.load(run_folder / "front.npz")
+    assert record is not None
+    for name in ("preferences", "returns", "discounted_returns", "episode_lengths"):
+        np.testing.assert_array_equal(getattr(record, name), getattr(saved, name))
+
+
+def test_the_front_is_predicted_and_rolled_out_as_it_was_evaluated(kit):
+    for k, preference in enumerate(kit.front.preferences):
+        w = kit.check(preference.tolist())
+        np.testing.assert_allclose(kit.predict(w)["returns"], kit.measured[k], rtol=1e-5)
+    rollout = kit.show_rollout(kit.check([0.0, 1.0]))
+    assert kit.run.front.preferences[0].tolist() == [0.0, 1.0]
+    np.testing.assert_allclose(rollout["discounted"], kit.measured[0])
+    np.testing.assert_allclose(rollout["returns"], kit.run.values[0])
+    np.testing.assert_allclose(kit.around(kit.check([0.0, 1.0]))["seeds"], [kit.measured[0]])
+
+
+def test_spread_is_the_deviation_over_episodes(kit, monkeypatch):
+    """1 and 3, 3 and 7: the means 2 and 5, the deviations sqrt(2) and 2 sqrt(2)."""
+    w = kit.check([0.4, 0.6])
+    discounted = np.array([[[1.0, 3.0], [3.0, 7.0]]])
+    front = ParetoFront(w[None], 10 * discounted, discounted, np.array([[5, 8]]))
+    monkeypatch.setitem(kit._rollouts, w.tobytes(), Rollouts(front, kit.survey.behaviour[:1], np.zeros(1), kit.survey.starts))
+    shown = kit.show_rollout(w)
+    assert (shown["n_episodes"], shown["steps"]) == (2, 6.5)
+    for name, expected in (("discounted", [2, 5]), ("returns", [20, 50])):
+        np.testing.assert_allclose(shown[name], expected)
+    np.testing.assert_allclose(shown["discounted_spread"], [2**0.5, 8**0.5])
+    np.testing.assert_allclose(shown["spread"], [200**0.5, 800**0.5])
+
+
+def test_a_bound_is_met_in_the_rollout(kit):
+    preference = kit.check([0.5, 0.5])
+    for objective in (0, 1):
+        middle = float(kit.measured[:, objective].mean())
+        found = kit.meet(preference, objective, at_least=middle)
+        assert found["met"]
+        assert kit.rolled_out(np.array(found["preference"])).front.discounted_returns.mean(axis=1)[0, objective] >= middle
+    here = kit.rolled_out(preference).front.discounted_returns[0].mean(axis=0)
+    found = kit.meet(preference, 0, less=1.0)
+    assert found["at_least"] == pytest.approx(here[0] - 1)
+    assert found["met"]
+    assert found["discounted"][0] >= here[0] - 1
+
+
+def test_a_bound_that_nothing_meets_gives_the_closest(kit):
+    found = kit.meet(kit.check([0.5, 0.5]), 0, at_least=1e6)
+    assert not found["met"]
+    assert found["discounted"][0] == pytest.approx(kit.measured[:, 0].max())
+
+
+def test_a_prediction_that_was_too_good_is_corrected(kit, monkeypatch):
+    """Where the predictor promises too much, a bound is asked for more strictly, until the rollout keeps it."""
+    target = float(np.quantile(kit.measured[:, 0], 0.6))
+    monkeypatch.setattr(kit, "candidate_returns", kit.candidate_returns + np.array([0.3 * kit.ranges[0], 0]))
+    found = kit.meet(kit.check([0.1, 0.9]), 0, at_least=target)
+    assert found["met"]
+    assert found["n_rollouts"] > 1
+    assert found["discounted"][0] >= target
+    assert found["preference"] not in kit.front.preferences.tolist()  # It was searched for, not only looked up.
+
+
+def test_what_is_kept_acts_as_the_page_did(kit):
+    w = kit.check([0.3, 0.7])
+    kept = kit.keep(w)
+    folder = Path(kept["folder"])
+    assert kept["files"] == ["policy.onnx", "model.zip", "choice.json"]
+    assert folder == kit.folder.resolve() / "0.3_0.7"
+    choice = json.loads((folder / "choice.json").read_text())
+    assert (choice["preference"], choice["env"]) == (w.tolist(), "MO-Hopper-v4")
+    session, loaded = onnxruntime.InferenceSession(folder / "policy.onnx"), MOMBA.load(folder / "model.zip")
+    env = make_env("MO-Hopper-v4")
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        shown, _ = kit.model.predict(observation, preference=w, deterministic=True)
+        (one,) = session.run(["action"], {"observation": observation[None].astype(np.float32)})
+        np.testing.assert_allclose(one[0], shown, atol=1e-5)
+        np.testing.assert_array_equal(loaded.predict(observation, preference=w, deterministic=True)[0], shown)
+        observation, *_ = env.step(shown)
+    assert loaded.preference_sampler == w.tolist()
+    assert kit.model.preference_sampler is None
+
+
+def test_a_model_alone_is_surveyed(vector_model, monkeypatch):
+    with open_kit(vector_model, "MO-Hopper-v4", films=False) as kit:
+        assert len(kit.front.preferences) == 41
+        assert {one.name for one in kit.predictors} == {FRONT, CRITIC}
+        assert kit.no_film == "none are wanted"
+        assert kit.objectives == ["forward speed", "jumping height"]
+        begins = {FRONT: "Interpolated between the 41", CRITIC: "Predicted by the vector critic less its entropy bonus"}
+        for predictors in (kit.predictors, kit.predictors[::-1]):
+            monkeypatch.setattr(kit, "predictors", predictors)
+            assert kit.about_prediction().startswith(begins[predictors[0].name])
+        assert kit.feature(0) == "mean of observation[0]"
+        n = kit.model.policy.observation_dim
+        assert kit.feature(n) == "mean of action[0]"
+        assert kit.feature(n + 3) == "standard deviation of observation[0]"
+
+
+def test_calibration_says_how_often_a_prediction_is_right(run_folder, tmp_path, caplog):
+    caplog.set_level("INFO")
+    calibration = write_calibration(run_folder, None, 6, tmp_path / "calibration.png")
+    assert calibration.predicted[FRONT].shape == (6, 2)
+    assert (tmp_path / "calibration.png").read_bytes().startswith(b"\x89PNG")
+    share = 100 * share_close(calibration.predicted[FRONT], calibration.measured)
+    assert f"within 5 % on {share:.0f} % of 6 preferences" in caplog.text
+
+
+def with_model(folder: Path, model: Path) -> Path:
+    (folder / "model.zip").write_bytes(model.read_bytes())
+    return folder
+
+
+def test_what_cannot_be_chosen_from_is_refused(run_folder, vector_model, tmp_path):
+    fail(["live", tmp_path / "nothing"], "is no run: it does not exist")
+    fail(["live", run_folder / "model.zip"], "is a file, not a folder")
+    fail(["live", run_folder, "--env", "MO-Hopper-v4"], "is no file")
+    fail(["live", run_folder / "model.zip", "--env", "MO-HalfCheetah-v4"], "observation_space has shape")
+    fail(["live", run_folder / "model.zip", "--env", "Nonsense-v0"], "Nonsense")
+    values = np.array([[1.0, 2.0], [2.0, 1.0]])
+    no_model = write_run(tmp_path / "no_model", values, np.eye(2))
+    fail(["live", no_model], "has no policy to choose a preference for.*model.zip")
+    one = np.array([[0.5, 0.5]])
+    one_point = write_run(tmp_path / "one", values[:1], one, returns=values[None, :1])
+    fail(["live", with_model(one_point, vector_model)], "has one point")
+    other = write_run(tmp_path / "other", values, np.eye(2), env="MO-HalfCheetah-v4")
+    fail(["live", with_model(other, vector_model)], "observation_space has shape")
+    fail(["live", run_folder, "--seeds", other], "not of .* on MO-Hopper-v4")
+    fail(["calibrate", run_folder, "--preferences", "0"], "give at least 1")
+
+
+def test_a_single_objective_is_no_trade_off(tmp_path):
+    MOMBA("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY, buffer_size=10).save(tmp_path / "model.zip")
+    fail(["live", tmp_path / "model.zip", "--env", "Pendulum-v1"], "has one objective")
+
+
+def test_a_damaged_final_front_is_named(run_folder, tmp_path):
+    lines = (run_folder / "record.jsonl").read_text().splitlines()
+    end = json.loads(lines[-1])
+    end["front"]["discounted_returns"] = [[1.0]]
+    (tmp_path / "record.jsonl").write_text("\n".join([*lines[:-1], json.dumps(end)]) + "\n")
+    with pytest.raises(ValueError, match=r"record.jsonl: its final front .* do not go together"):
+        read_run(tmp_path)
