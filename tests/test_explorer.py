@@ -108,7 +108,7 @@ def test_what_hovering_shows(tmp_path):
     assert text.split("<br>")[1:] == [
         "speed: weight 0.00, return 10 ± 1.414",
         "height: weight 1.00, return 0 ± 1.414",
-        "± standard deviation over 2 episodes",
+        "Mean ± standard deviation of 2 episodes",
     ]
 
 

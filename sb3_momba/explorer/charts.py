@@ -191,11 +191,7 @@ def _texts(run: Run, objectives: Sequence[str]) -> list[str]:
             weight = "" if run.preferences is None else f"weight {run.preferences[k, j]:.2f}, "
             spread = "" if run.spread is None else f" ± {number(run.spread[k, j])}"
             lines.append(f"{as_label(name)}: {weight}return {number(values[j])}{spread}")
-        if run.n_episodes == 1:
-            lines.append("one episode")
-        else:
-            lines.append(f"± standard deviation over {run.n_episodes} episodes")
-        texts.append("<br>".join(lines))
+        texts.append("<br>".join([*lines, run.about_episodes]))
     return texts
 
 

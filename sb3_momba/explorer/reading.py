@@ -57,9 +57,17 @@ class Run:
         return np.asarray(self.front.returns.std(axis=1, ddof=1))
 
     @property
-    def n_episodes(self) -> int:
-        """Of each point."""
-        return 1 if self.front is None else self.front.returns.shape[1]
+    def n_episodes(self) -> int | None:
+        """Of each point; None where it is not recorded."""
+        return None if self.front is None else self.front.returns.shape[1]
+
+    @property
+    def about_episodes(self) -> str:
+        """What a point's numbers are."""
+        n = self.n_episodes
+        return (
+            "Episodes not recorded" if n is None else "One episode" if n == 1 else f"Mean ± standard deviation of {n} episodes"
+        )
 
     @property
     def regrets(self) -> Array | None:

@@ -92,7 +92,7 @@ def add_films(run: Run, n_films: int) -> None:
         with RenderingProcess(needs_gl=check_filmable(policy)) as process:
             for k in spread_out(run.preferences, n_films):
                 # Where its first episode stood among those of the evaluation.
-                number = k * run.n_episodes
+                number = k * (run.n_episodes or 1)
                 run.films[k] = process.call(film, policy, run.preferences[k], number, seed, process.backend)
                 logger.info("%s: film %d of %d", run.name, len(run.films), min(n_films, len(run.preferences)))
     except (RenderingError, ValueError, OSError, ImportError, gym.error.Error) as error:
@@ -171,7 +171,7 @@ def run_numbers(run: Run, i: int) -> dict[str, Any]:
         "spread": None if run.spread is None else run.spread.tolist(),
         "regrets": None if run.regrets is None else run.regrets.tolist(),
         "on_front": run.on_front.tolist(),
-        "n_episodes": run.n_episodes,
+        "episodes": run.about_episodes,
         "films": films,
         "no_films": run.no_films,
     }

@@ -1,12 +1,16 @@
 "use strict";
 // What the report and the live page share.
 const explorer = (() => {
+  const stillness = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const config = { responsive: true, displaylogo: false, displayModeBar: false };
+  const at = (id) => document.getElementById(id);
+
   // As charts.number writes them.
   function number(x) {
     for (const [size, unit] of [[1e12, ""], [1e9, " G"], [1e6, " M"]]) {
       if (Math.abs(x) >= size) return size === 1e12 ? x.toExponential(3) : `${Number((x / size).toPrecision(4))}${unit}`;
     }
-    if (Math.abs(x) >= 1000) return Math.round(x).toLocaleString("en");
+    if (Math.abs(x) >= 1000) return x.toLocaleString("en", { maximumFractionDigits: 0 });
     return x === 0 || Math.abs(x) >= 1e-3 ? String(Number(x.toPrecision(4))) : x.toExponential(1);
   }
 
@@ -31,36 +35,78 @@ const explorer = (() => {
     return one.url;
   }
 
-  // A return over a film, with a cursor; `height` gives the picture's y, from 0 to 32.
-  function sparkline(returns, i, height, longest, colour) {
-    const points = returns.map((r, k) => `${(100 * k) / longest},${height(r[i]).toFixed(2)}`).join(" ");
-    const picture = svg("svg", { viewBox: "0 0 100 32", preserveAspectRatio: "none", "aria-hidden": "true" });
-    picture.append(
-      svg("line", { x1: 0, x2: 100, y1: height(0), y2: height(0), stroke: "#d9dee3", "vector-effect": "non-scaling-stroke" }),
-      svg("polyline", { points, fill: "none", stroke: colour, "stroke-width": 1.5, "vector-effect": "non-scaling-stroke" }),
-      svg("line", { id: `cursor-${i}`, y1: 0, y2: 32, stroke: "#1f2933", "vector-effect": "non-scaling-stroke" }),
-    );
-    picture.dataset.longest = longest;
-    return picture;
+  // A row of an objective: its name, its return over the film with a cursor, so far, and in all. Without a film the name and
+  // an empty cell. `films` share a scale.
+  function returnRow(name, i, film, films, colour) {
+    const row = element("tr");
+    const cell = element("td", undefined, { class: "spark" });
+    row.append(element("th", name, { scope: "row" }), cell);
+    if (film !== null) {
+      const every = films.flatMap((one) => one.returns.map((r) => r[i]));
+      const [low, high] = [Math.min, Math.max].map((end) => every.reduce((a, b) => end(a, b), 0));
+      const longest = Math.max(...films.map((one) => one.returns.length)) - 1 || 1;
+      const height = (x) => 30 - (28 * (x - low)) / (high > low ? high - low : 1);
+      const points = film.returns.map((r, k) => `${(100 * k) / longest},${height(r[i]).toFixed(2)}`).join(" ");
+      const picture = svg("svg", { viewBox: "0 0 100 32", preserveAspectRatio: "none", "aria-hidden": "true" });
+      picture.append(
+        svg("line", { x1: 0, x2: 100, y1: height(0), y2: height(0), stroke: "#d9dee3", "vector-effect": "non-scaling-stroke" }),
+        svg("polyline", { points, fill: "none", stroke: colour, "stroke-width": 1.5, "vector-effect": "non-scaling-stroke" }),
+        svg("line", { id: `cursor-${i}`, y1: 0, y2: 32, stroke: "#1f2933", "vector-effect": "non-scaling-stroke" }),
+      );
+      picture.dataset.longest = longest;
+      cell.append(picture);
+      row.append(element("td", "0", { class: "now", id: `now-${i}` }), element("td", number(film.total[i])));
+    }
+    return row;
   }
 
-  // A return's height in a sparkline, 0 included.
-  function scale(values) {
-    const low = values.reduce((a, b) => Math.min(a, b), 0);
-    const high = values.reduce((a, b) => Math.max(a, b), 0);
-    return (x) => 30 - (28 * (x - low)) / (high > low ? high - low : 1);
-  }
+  // The page's film, and the numbers beside it in step with it.
+  class Player {
+    film = null;
+    #fps;
+    #frame = 0; // of the one loop that runs while the film plays
 
-  // The numbers beside a film, in step with it.
-  function showFrame(video, fps, returns) {
-    const frame = Math.min(Math.floor(video.currentTime * fps + 1e-6), returns.length - 1);
-    returns[frame].forEach((value, i) => {
-      document.getElementById(`now-${i}`).textContent = number(value);
-      const cursor = document.getElementById(`cursor-${i}`);
-      const x = (100 * frame) / Number(cursor.parentNode.dataset.longest);
-      cursor.setAttribute("x1", x);
-      cursor.setAttribute("x2", x);
-    });
+    constructor(fps) {
+      this.#fps = fps;
+      at("film").addEventListener("play", () => this.#run());
+      at("film").addEventListener("seeked", () => this.tick());
+    }
+
+    // `caption` and `preference` in words; a film of null shows nothing.
+    show(film, caption, preference) {
+      if (film !== this.film) {
+        this.film = film;
+        if (film === null) {
+          at("film").removeAttribute("src");
+        } else {
+          at("film").src = urlOf(film);
+          if (!stillness) at("film").play().catch(() => {}); // It may not be allowed to; there are controls.
+        }
+      }
+      if (film === null) return;
+      const speed = film.speed === null ? "" : `, ${Number(film.speed.toPrecision(2))}× real time`;
+      at("film-caption").textContent = `${caption}. ${film.steps.toLocaleString("en")} steps${speed}.`;
+      at("film").setAttribute("aria-label", `Rollout under the preference ${preference}`);
+    }
+
+    tick() {
+      if (this.film === null) return;
+      const { returns } = this.film;
+      const frame = Math.min(Math.floor(at("film").currentTime * this.#fps + 1e-6), returns.length - 1);
+      returns[frame].forEach((value, i) => {
+        at(`now-${i}`).textContent = number(value);
+        const cursor = at(`cursor-${i}`);
+        const x = (100 * frame) / Number(cursor.closest("svg").dataset.longest);
+        cursor.setAttribute("x1", x);
+        cursor.setAttribute("x2", x);
+      });
+    }
+
+    #run() {
+      cancelAnimationFrame(this.#frame);
+      this.tick();
+      if (!at("film").paused) this.#frame = requestAnimationFrame(() => this.#run());
+    }
   }
 
   // Where a point of returns is drawn, as charts.coordinates has it.
@@ -70,5 +116,5 @@ const explorer = (() => {
     return { x: [values.map((_, i) => i)], y: [heights] };
   }
 
-  return { coordinates, element, number, scale, showFrame, sparkline, urlOf };
+  return { Player, at, config, coordinates, element, number, returnRow, stillness };
 })();

@@ -1,18 +1,15 @@
 (() => {
   const page = JSON.parse(document.getElementById("data").textContent);
-  const { coordinates, element, number, scale, showFrame, sparkline, urlOf } = explorer;
-  const at = (id) => document.getElementById(id);
+  const { Player, at, config, coordinates, element, number, returnRow } = explorer;
   const { objectives } = page;
   const two = objectives.length === 2;
-  const stillness = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const config = { responsive: true, displaylogo: false, displayModeBar: false };
   const SETTLED = 350; // ms without a move, after which the policy is rolled out
   const STEPS = 100; // of a slider
   const PREDICTED = page.front.data.length - 2;
   const ROLLOUT = page.front.data.length - 1;
+  const player = new Player(page.fps);
   let preference = page.start;
-  let film = null;
-  let wish = 0; // counts the chosen preferences: answers to earlier ones are not shown
+  let wish = 0;
   let settling = null;
   let asking = false;
   const said = { predicted: "", rollout: "" };
@@ -32,12 +29,11 @@
     }
     const content = await answer.json();
     if (!answer.ok) throw new Error(content.error);
-    if (content.superseded) throw Object.assign(new Error("Something newer was asked for."), { isOld: true });
+    if (content.superseded) throw new Error("Another page asked for something newer meanwhile: ask again.");
     return content;
   }
 
   function complain(error) {
-    if (error.isOld) return;
     at("trouble").textContent = error.message;
     at("trouble").hidden = false;
   }
@@ -79,64 +75,63 @@
     });
   }
 
+  // The page is "moved", then "rolling" and "filming", or searches a "bound", and at last it is "still". What begins cancels
+  // what was under way: whoever waited for an answer asks `current()` before it shows that, and before it asks for more.
+  function begin(state) {
+    clearTimeout(settling);
+    wish += 1;
+    const mine = wish;
+    enter(state);
+    return () => mine === wish;
+  }
+
+  function enter(state) {
+    document.body.dataset.state = state;
+    at("status").textContent = { rolling: "Rolling out …", filming: "Filming …" }[state] || "";
+  }
+
   function choose(w) {
     preference = w;
-    wish += 1;
-    document.body.dataset.state = "moved";
+    begin("moved");
     at("trouble").hidden = true;
     showSliders();
     waiting();
     predict();
-    clearTimeout(settling);
     settling = setTimeout(settle, SETTLED);
-  }
-
-  // How long the last answer took to come, in ms: without what this page did meanwhile.
-  function roundTrip(action) {
-    const timed = performance.getEntriesByName(new URL(action, location.href).href).at(-1);
-    performance.clearResourceTimings();
-    return timed && timed.duration;
   }
 
   // One question at a time; what was moved meanwhile is asked next.
   async function predict() {
     if (asking) return;
     asking = true;
-    const mine = wish;
+    const asked = preference;
     try {
       const start = performance.now();
-      const answer = await ask("/predict", { preference });
-      showPrediction(answer, roundTrip("/predict") || performance.now() - start);
+      showPrediction(await ask("/predict", { preference }), performance.now() - start);
     } catch (error) {
       complain(error);
     }
     asking = false;
     document.body.dataset.ready = "true";
-    if (mine !== wish) predict();
+    if (asked !== preference) predict();
   }
 
   async function settle() {
-    const mine = wish;
-    const current = () => mine === wish;
-    document.body.dataset.state = "rolling";
+    const current = begin("rolling");
+    const steps = [["rolling", "/around", showAround], ["rolling", "/rollout", showRollout]];
+    if (!page.noFilm) steps.push(["filming", "/film", showFilm]);
     try {
-      showAround(await ask("/around", { preference }), current());
-      at("status").textContent = "Rolling out …";
-      const rollout = await ask("/rollout", { preference });
-      if (!current()) return;
-      showRollout(rollout);
-      if (!page.noFilm) {
-        at("status").textContent = "Filming …";
-        const next = await ask("/film", { preference });
+      for (const [state, action, show] of steps) {
+        enter(state);
+        const answer = await ask(action, { preference });
         if (!current()) return;
-        showFilm(next);
+        show(answer);
       }
     } catch (error) {
-      if (!current() || error.isOld) return;
+      if (!current()) return;
       complain(error);
     }
-    at("status").textContent = "";
-    document.body.dataset.state = "still";
+    enter("still");
   }
 
   // --------------------------------------------------------------------------------------------------- answers
@@ -193,7 +188,11 @@
       text.append(element("strong", written(one.preference)), ` returns ${one.returns.map(number).join(" / ")}; difference `,
         `${number(Number(one.distance.toPrecision(2)))}, most in the ${one.differs}`);
       const button = element("button", "Show", { type: "button", "aria-label": `Show ${described(one.preference)}` });
-      button.addEventListener("click", () => { choose(one.preference); at("choose").scrollIntoView(); });
+      button.addEventListener("click", () => {
+        choose(one.preference);
+        at("choose").scrollIntoView();
+        at("weight-0").focus({ preventScroll: true }); // This button goes away with the next rollout.
+      });
       item.append(text, button);
       return item;
     });
@@ -203,38 +202,16 @@
   }
 
   function showFilm(next) {
-    if (film !== null) URL.revokeObjectURL(film.url);
-    film = next;
-    at("film").src = urlOf(film);
-    if (!stillness) at("film").play().catch(() => {}); // It may not be allowed to; there are controls.
-    const speed = film.speed === null ? "" : `, ${Number(film.speed.toPrecision(2))}× real time`;
-    at("film-caption").textContent = `${described(film.preference)}. ${film.steps.toLocaleString("en")} steps${speed}.`;
-    at("film").setAttribute("aria-label", `Rollout under the preference ${described(film.preference)}`);
-    at("film-returns").replaceChildren(...objectives.map((name, i) => {
-      const row = element("tr");
-      const cell = element("td", undefined, { class: "spark" });
-      const height = scale(film.returns.map((r) => r[i]));
-      cell.append(sparkline(film.returns, i, height, film.returns.length - 1 || 1, "#0072b2"));
-      row.append(element("th", name, { scope: "row" }), cell, element("td", "0", { class: "now", id: `now-${i}` }));
-      row.append(element("td", number(film.total[i])));
-      return row;
-    }));
+    if (player.film !== null) URL.revokeObjectURL(player.film.url);
+    const shown = described(next.preference);
+    player.show(next, shown, shown);
+    at("film-returns").replaceChildren(...objectives.map((name, i) => returnRow(name, i, next, [next], "#0072b2")));
     at("film-table").hidden = false;
     at("film-returns").classList.remove("stale");
-    tick();
+    player.tick();
   }
 
-  function tick() {
-    if (film !== null) showFrame(at("film"), page.fps, film.returns);
-  }
-
-  function everyFrame() {
-    tick();
-    if (!at("film").paused) requestAnimationFrame(everyFrame);
-  }
-
-  function showAround(answer, isCurrent) {
-    if (!isCurrent) return;
+  function showAround(answer) {
     at("rates").replaceChildren(two ? rateSentences(answer.rates) : rateTable(answer.rates));
     at("seeds").textContent = "";
     if (answer.seeds.length === 0) return;
@@ -288,8 +265,7 @@
     try {
       answerBox.replaceChildren(...(await work()));
     } catch (error) {
-      const text = error.isOld ? "The preference was moved meanwhile: ask again." : error.message;
-      answerBox.replaceChildren(element("p", text, { class: "bad" }));
+      answerBox.replaceChildren(element("p", error.message, { class: "bad" }));
     }
     button.disabled = false;
     button.textContent = before;
@@ -300,7 +276,14 @@
     const before = preference;
     const objective = Number(at("bound-objective").value);
     const value = Number(at("bound-value").value);
-    const found = await ask("/bound", { preference, objective, [at("bound-kind").value]: value });
+    const current = begin("bound");
+    const bound = { preference, objective, [at("bound-kind").value]: value };
+    const found = await ask("/bound", bound).catch((error) => ({ error }));
+    if (!current()) throw new Error("The preference was moved meanwhile: ask again.");
+    if (found.error) {
+      settle(); // as this search cancelled it
+      throw found.error;
+    }
     choose(found.preference);
     const name = objectives[objective];
     const returns = objectives.map((one, i) => `${one} ${number(found.discounted[i])}`).join(", ");
@@ -330,8 +313,6 @@
       working(at("bound").querySelector("button"), at("bound-answer"), findBound);
     });
     at("keep").addEventListener("click", () => working(at("keep"), at("kept"), keepThisOne));
-    at("film").addEventListener("play", everyFrame);
-    at("film").addEventListener("seeked", tick);
     at("no-film").textContent = `No film: ${page.noFilm}`;
     at("no-film").hidden = !page.noFilm;
     at("film").hidden = Boolean(page.noFilm);

@@ -1,12 +1,9 @@
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
-  const { coordinates, element, number, scale, showFrame, sparkline, urlOf } = explorer;
-  const at = (id) => document.getElementById(id);
+  const { Player, at, config, coordinates, element, number, returnRow, stillness } = explorer;
   const { runs, objectives } = report;
-  const stillness = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const config = { responsive: true, displaylogo: false, displayModeBar: false };
   const selected = { run: 0, point: 0 };
-  let film = null;
+  const player = new Player(report.fps);
 
   const weights = (run, point) =>
     run.preferences === null ? `solution ${point + 1}` : run.preferences[point].map((w) => w.toFixed(2)).join(" / ");
@@ -45,58 +42,25 @@
     at("no-film").hidden = has;
     at("no-film").textContent = has ? "" : `No films: ${run.no_films}`;
     document.querySelectorAll(".film-only").forEach((cell) => { cell.hidden = !has; });
-    const next = has ? run.films[nearest(run, selected.point, stops(run))] : null;
-    if (next !== film) {
-      film = next;
-      if (film === null) {
-        at("film").removeAttribute("src");
-      } else {
-        at("film").src = urlOf(film);
-        if (!stillness) at("film").play().catch(() => {}); // It may not be allowed to; there are controls.
-      }
-    }
-    if (film === null) return;
-    const speed = film.speed === null ? "" : `, ${Number(film.speed.toPrecision(2))}× real time`;
-    const whose = film.point === selected.point ? "" : "The nearest filmed preference: ";
-    at("film-caption").textContent = `${whose}${describe(run, film.point)}. ${film.steps.toLocaleString("en")} steps${speed}.`;
-    at("film").setAttribute("aria-label", `Rollout under the preference ${describe(run, film.point)}`);
+    const film = has ? run.films[nearest(run, selected.point, stops(run))] : null;
+    const shown = film && describe(run, film.point);
+    player.show(film, (film && film.point !== selected.point ? "The nearest filmed preference: " : "") + shown, shown);
   }
 
-  // A row for each objective: its name, its return over the film, so far, of the film, and the mean of the evaluation.
+  // A row for each objective: what the film returns, and the mean of the evaluation.
   function showReturns() {
     const run = runs[selected.run];
-    const rows = objectives.map((name, i) => {
-      const row = element("tr");
-      row.append(element("th", name, { scope: "row" }));
-      const cell = element("td", undefined, { class: "spark" });
-      if (film !== null) {
-        const height = scale(run.films.flatMap((one) => one.returns.map((r) => r[i])));
-        const longest = Math.max(...run.films.map((one) => one.returns.length)) - 1 || 1;
-        cell.append(sparkline(film.returns, i, height, longest, run.colour));
-      }
-      row.append(cell);
-      if (film !== null) {
-        row.append(element("td", "0", { class: "now", id: `now-${i}` }), element("td", number(film.total[i])));
-      }
+    at("returns").replaceChildren(...objectives.map((name, i) => {
+      const row = returnRow(name, i, player.film, run.films, run.colour);
       const spread = run.spread === null ? "" : ` ± ${number(run.spread[selected.point][i])}`;
       row.append(element("td", number(run.values[selected.point][i]) + spread));
       return row;
-    });
-    at("returns").replaceChildren(...rows);
-    const parts = [run.n_episodes === 1 ? "Mean of one episode" : `Mean ± standard deviation of ${run.n_episodes} episodes`];
+    }));
+    const parts = [run.episodes];
     if (run.regrets !== null) parts.push(`preference regret ${number(run.regrets[selected.point])}`);
     parts.push(run.on_front[selected.point] ? "on the front" : "dominated by another point");
     at("about-point").textContent = `${parts.join("; ")}.`;
-    tick();
-  }
-
-  function tick() {
-    if (film !== null) showFrame(at("film"), report.fps, film.returns);
-  }
-
-  function everyFrame() {
-    tick();
-    if (!at("film").paused) requestAnimationFrame(everyFrame);
+    player.tick();
   }
 
   function showSlider() {
@@ -213,8 +177,6 @@
     at("preference").addEventListener("input", () => {
       select(selected.run, stops(runs[selected.run])[Number(at("preference").value)]);
     });
-    at("film").addEventListener("play", everyFrame);
-    at("film").addEventListener("seeked", tick);
     showTable();
     const first = stops(runs[0]);
     select(0, first[Math.floor(first.length / 2)]);
