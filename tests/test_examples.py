@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from sb3_momba import MOMBA
 from sb3_momba.train import parse
 from sb3_momba.zoo.configuration import check_hyperparameters
 
@@ -12,12 +13,31 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def run(name: str, *arguments: str, cwd: Path, timeout: float = 300) -> str:
+    return call(EXAMPLES / name, *arguments, cwd=cwd, timeout=timeout)
+
+
+def call(*arguments: str | Path, cwd: Path, timeout: float = 300) -> str:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-    command = [sys.executable, EXAMPLES / name, *arguments]
+    command = [sys.executable, *arguments]
     ended = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "Warning" not in ended.stderr, ended.stderr
     return ended.stdout
+
+
+def test_the_quick_start(tmp_path):
+    said = run("quickstart.py", "100", cwd=tmp_path)
+    assert "hypervolume" in said
+    assert "action for 30 % speed, 70 % height: [" in said
+    assert (tmp_path / "front.png").exists()
+
+
+def test_the_demo(tmp_path):
+    said = run("demo.py", "40", cwd=tmp_path)
+    assert "mo-hopper-2obj-v5, " in said
+    assert "times that of the better of the two that learned nothing" in said
+    (folder,) = (tmp_path / "runs" / "demo").iterdir()
+    assert (folder / "model.zip").exists()
 
 
 def test_an_environment_of_ones_own(tmp_path):
@@ -55,10 +75,14 @@ def test_two_methods_and_their_report(tmp_path):
     assert "## Aggregate" in said
 
 
-def test_hyperparameters_as_yaml():
+def test_hyperparameters_as_yaml(tmp_path):
     settings = parse(["--env", "mo-hopper-2obj-v5", "--conf", str(EXAMPLES / "zoo.yml")])
     assert (settings.steps, settings.hyperparameters["her"]) == (20_000, True)
     assert check_hyperparameters(settings.policy, settings.hyperparameters) is None
+    zoo = ["-m", "sb3_momba.zoo", "train", "--env", "mo-hopper-2obj-v5", "--conf-file", EXAMPLES / "zoo.yml"]
+    call(*zoo, "--n-timesteps", "60", "--hyperparams", "learning_starts:20", cwd=tmp_path)
+    (model,) = (tmp_path / "logs").rglob("momba-*.zip")
+    assert MOMBA.load(model).num_timesteps == 60
 
 
 def test_a_sweep_and_its_report(tmp_path):
