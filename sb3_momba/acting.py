@@ -21,7 +21,14 @@ from sb3_momba.checkpoints.checkpoint import resume
 from sb3_momba.checkpoints.folders import Checkpoint
 from sb3_momba.checkpoints.training_state import callbacks_below, given_callback, set_states_of_callbacks
 from sb3_momba.diagnostics import NegativeReturnWatch
-from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
+from sb3_momba.envs.preferences import (
+    FixedSampler,
+    PreferenceSampler,
+    SamplerSpec,
+    check_preference,
+    make_sampler,
+    preference_dim,
+)
 from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
 from sb3_momba.exploration import HeldNoise
 from sb3_momba.export import export_policy
@@ -106,7 +113,8 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         """The policy's action, within the bounds of the action space.
 
         :param observation: as the environment gives it, (observation_dim,) or (batch, observation_dim), with `preference`;
-            or [observation, w], as the wrapped environment gives it, without
+            or [observation, w], as the wrapped environment gives it, without; a model whose `preference_sampler` keeps one
+            preference takes the environment's own without, too
         :param preference: (n_objectives,) or (batch, n_objectives)
         :param deterministic: the mean action instead of a sample
         :return: (action_dim,) or (batch, action_dim), and `state`
@@ -138,12 +146,15 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
         width = observation.shape[-1] if observation.ndim > 0 else 0
         if preference is None:
-            if width == raw != wrapped:
+            if width != raw or raw == wrapped:
+                return observation
+            sampler = None if self.preference_sampler is None else make_sampler(self.preference_sampler, self.n_objectives)
+            if not isinstance(sampler, FixedSampler):
                 raise ValueError(
                     f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights; "
                     "for EvalCallback and evaluate_policy, make the environment by make_mo_vec_env."
                 )
-            return observation
+            preference = sampler.preference
         w = check_preference(preference, self.n_objectives)
         if wrapped == raw:
             return observation

@@ -531,6 +531,20 @@ def test_one_objective_needs_no_preference_and_accepts_only_one():
         model.predict(OBSERVATIONS, preference=[0.5, 0.5])
 
 
+@pytest.mark.parametrize(
+    "sampler",
+    [[0.25, 0.75], {"name": "fixed", "preference": [0.25, 0.75]}, FixedSampler((0.25, 0.75))],
+    ids=["list", "name", "object"],
+)
+def test_a_model_of_one_preference_needs_none(sampler):
+    model = tiny_model(StubEnv(), preference_sampler=sampler)
+    for observation in (OBSERVATIONS, OBSERVATIONS[0]):
+        expected = model.predict(observation, preference=[0.25, 0.75], deterministic=True)[0]
+        np.testing.assert_array_equal(model.predict(observation, deterministic=True)[0], expected)
+        other = model.predict(observation, preference=[0.75, 0.25], deterministic=True)[0]
+        assert not np.array_equal(other, expected)
+
+
 WITH_PREFERENCE = np.zeros((7, 5), dtype=np.float32)
 PREDICTION_ERRORS = [
     (OBSERVATIONS, None, r"no preference.*preference=.* 2 weights"),
