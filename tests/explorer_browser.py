@@ -1,6 +1,7 @@
 """A page of the explorer in Chromium, for the tests of the report and of the live page."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,3 +57,15 @@ def wait_until(page: Page, expression: str) -> None:
 
 def text(page: Page, selector: str) -> str:
     return str(page.text_content(selector))
+
+
+def click_on_point(page: Page, values: Sequence[float]) -> None:
+    """Where the front's chart of two objectives shows these returns."""
+    x, y = page.evaluate(
+        """(values) => {
+            const chart = document.getElementById("front");
+            const box = chart.getBoundingClientRect(), { xaxis, yaxis } = chart._fullLayout;
+            return [box.left + xaxis._offset + xaxis.d2p(values[0]), box.top + yaxis._offset + yaxis.d2p(values[1])]; }""",
+        list(values),
+    )
+    page.mouse.click(x, y)

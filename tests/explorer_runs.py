@@ -23,6 +23,21 @@ from sb3_momba.records import RecordWriter
 from sb3_momba.runs import RunSettings, run
 
 TINY = {"net_arch": [8], "n_atoms": 11}
+NUMBERS = {  # and how charts.number and common.js write them
+    0.0: "0",
+    0.12345: "0.1235",
+    -12.345: "-12.35",
+    100.25: "100.3",
+    999.96: "1000",
+    1234.5: "1,235",
+    -2500.5: "-2,501",
+    999_999.7: "1,000,000",
+    1.2345e6: "1.234 M",  # 1.23449999...
+    2e9: "2 G",
+    1.5e300: "1.500e+300",
+    3e-5: "3.0e-5",
+    -2.5e-12: "-2.5e-12",
+}
 HOW = "run `make browser` as root, or `apt-get install chromium libegl1 libgl1-mesa-dri`"
 
 

@@ -4,12 +4,16 @@ import json
 import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import plotly.graph_objects as go
+import psutil
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
@@ -22,26 +26,14 @@ from sb3_momba.explorer.rendering import Policy, RenderingProcess, film, record_
 from sb3_momba.explorer.report import add_films, fill, json_in_html, page_file, spread_out, to_html
 from sb3_momba.explorer.stage import RenderingError, Stage, backends, camera_on, follow
 from sb3_momba.explorer.strobe import draw_strobe
-from tests.explorer_runs import TINY, needs_gl, simplex, train_tiny, write_run
+from tests.explorer_runs import NUMBERS, TINY, needs_gl, simplex, train_tiny, write_run
 from tests.stubs import tiny_model
 
 VALUES = np.array([[0.0, 10.0], [6.0, 6.0], [10.0, 0.0]])
 PREFERENCES = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]])
 
 
-@pytest.mark.parametrize(
-    ("x", "text"),
-    [
-        (0.0, "0"),
-        (0.12345, "0.1235"),
-        (-12.345, "-12.35"),
-        (1234.5, "1,234"),
-        (1.2345e6, "1.234 M"),
-        (2e9, "2 G"),
-        (3e-5, "3.0e-05"),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("x", "text"), NUMBERS.items(), ids=str)
 def test_numbers_have_four_digits(x, text):
     assert charts.number(x) == text
 
@@ -342,6 +334,28 @@ def test_films_show_what_was_evaluated(tiny_run):
         np.testing.assert_array_equal(one.returns[0], [0, 0])
         assert one.video[4:8] == b"ftyp"
         assert len(one.video) < 300_000
+
+
+LONELY = """
+import os, sys
+from sb3_momba.explorer.rendering import RenderingProcess
+if __name__ == "__main__":
+    with RenderingProcess(needs_gl=False) as process:
+        print(process.call(os.getpid), flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=lambda how: how.name)
+def test_no_process_is_left_behind(how, tmp_path):
+    (tmp_path / "lonely.py").write_text(LONELY)
+    started = subprocess.Popen([sys.executable, tmp_path / "lonely.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    pid = int(started.stdout.readline())
+    assert psutil.pid_exists(pid)
+    started.send_signal(how)
+    started.communicate()
+    psutil.wait_procs([psutil.Process(pid)] if psutil.pid_exists(pid) else [], timeout=30)
+    assert not psutil.pid_exists(pid)
 
 
 def test_a_crash_of_the_process_is_said():

@@ -1,5 +1,7 @@
 """The decision kit's mathematics, by hand."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,8 @@ from sb3_momba.explorer.decisions import (
     predict_returns,
     rank_for_bound,
 )
-from sb3_momba.explorer.prediction import share_close
+from sb3_momba.explorer.prediction import front_predictor, share_close
+from sb3_momba.pareto.evaluation import ParetoFront
 
 TWO = np.array([[0.0, 1.0], [0.25, 0.75], [0.5, 0.5], [1.0, 0.0]])
 
@@ -38,6 +41,18 @@ def test_three_objectives_are_interpolated_in_the_triangle_around():
     preferences = np.array([[1, 0, 0], [0, 0.5, 0.5], [0, 1, 0], [0, 0, 1.0]])
     returns = np.array([[8.0], [2.0], [100.0], [200.0]])
     np.testing.assert_allclose(predict_returns(np.array([[0.5, 0.25, 0.25]]), preferences, returns), [[5.0]])
+
+
+def test_three_objectives_are_predicted_in_time():
+    """Under 100 ms with an error: the median of 20, as this machine may be busy."""
+    preferences = simplex_lattice(3, 12)
+    front = ParetoFront(preferences, preferences[:, None], preferences[:, None], np.ones((len(preferences), 1), dtype=np.int64))
+    predictor, seconds = front_predictor(front), []
+    for wanted in np.random.default_rng(0).dirichlet(np.ones(3), size=(20, 1)):
+        start = time.perf_counter()
+        predictor.predict(wanted), predictor.error_at(wanted)
+        seconds.append(time.perf_counter() - start)
+    assert np.median(seconds) < 0.1
 
 
 def test_outside_of_the_evaluated_preferences_the_nearest_one_speaks():
@@ -70,12 +85,19 @@ def test_a_share_counts_rows_that_are_close_in_every_objective():
 def test_exchange_rates_are_the_slope_of_the_front():
     """On (10 w, 20 (1 - w)) one unit of the first objective is worth two of the second, and 1/2 the other way."""
     rates = exchange_rates(lambda w: w * [10.0, 20.0], np.array([0.4, 0.6]), np.array([10.0, 20.0]))
-    np.testing.assert_allclose(rates, [[np.nan, 2.0], [0.5, np.nan]])
+    nothing = [np.nan, np.nan]
+    np.testing.assert_allclose(rates, [[nothing, [-1, 2.0]], [[0.5, -1], nothing]])
 
 
-def test_three_objectives_have_a_rate_for_each_pair():
-    rates = exchange_rates(lambda w: w * [1.0, 2.0, 8.0], np.full(3, 1 / 3), np.array([1.0, 2.0, 8.0]))
-    np.testing.assert_allclose(rates, [[np.nan, 2, 8], [0.5, np.nan, 4], [1 / 8, 1 / 4, np.nan]])
+def test_three_objectives_have_a_trade_for_each_pair_and_what_it_does_to_the_third():
+    """The third objective gains 4 for each weight of the first that is lost, whoever gets it."""
+    slopes = np.array([[1.0, 0.0, -4.0], [0.0, 2.0, 0.0], [0.0, 0.0, 8.0]])
+    rates = exchange_rates(lambda w: w @ slopes, np.full(3, 1 / 3), np.array([1.0, 2.0, 8.0]))
+    expected = {(0, 1): [-1, 2, 4], (0, 2): [-1, 0, 12], (1, 0): [0.5, -1, -2], (1, 2): [0, -1, 4]}
+    expected |= {(2, 0): [1 / 12, 0, -1], (2, 1): [0, 1 / 4, -1]}
+    for pair, change in expected.items():
+        np.testing.assert_allclose(rates[pair], change, atol=1e-12)
+    assert np.isnan(rates[range(3), range(3)]).all()
 
 
 def test_no_rate_where_nothing_is_traded():
@@ -84,7 +106,7 @@ def test_no_rate_where_nothing_is_traded():
     at_the_end = exchange_rates(lambda w: w * [10.0, 20.0], np.array([1.0, 0.0]), np.array([10.0, 20.0]))
     assert np.isnan(flat).all()
     assert np.isnan(both_fall).all()
-    np.testing.assert_allclose(at_the_end, [[np.nan, 2.0], [0.5, np.nan]])  # The slope of the one side there is.
+    np.testing.assert_allclose(at_the_end[[0, 1], [1, 0]], [[-1, 2.0], [0.5, -1]])  # The slope of the one side there is.
 
 
 def test_a_bound_is_kept_with_the_most_of_the_rest():
@@ -102,7 +124,8 @@ def test_alternatives_return_alike_and_move_differently():
     returns = np.array([[1.0, 1.0], [1.1, 0.9], [1.1, 0.9], [5.0, 1.0]])
     behaviour = np.array([[0.0, 0.0, 7.0], [0.0, 0.2, 7.0], [2.0, 0.0, 7.0], [2.0, 4.0, 7.0]])
     found = find_alternatives(returns[0], behaviour[0], returns, behaviour, np.array([0.2, 0.2]))
-    assert [(one.index, one.feature) for one in found] == [(2, 0), (1, 1)]  # neither itself nor the one that returns more
+    # Neither itself, nor its neighbour that moves all but alike, nor the one that returns more.
+    assert [(one.index, one.feature) for one in found] == [(2, 0)]
     scaled = behaviour[:, :2] / behaviour[:, :2].std(axis=0)
     pairs = [np.sqrt(((scaled[i] - scaled[j]) ** 2).sum() / 3) for i in range(4) for j in range(i)]
     assert found[0].distance == pytest.approx(np.sqrt(scaled[2, 0] ** 2 / 3) / np.mean(pairs))

@@ -1,6 +1,7 @@
 """The decision kit: critics by hand, what it answers about a real run, and what it refuses."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,10 @@ from sb3_momba import MOMBA
 from sb3_momba.envs.wrappers import make_env
 from sb3_momba.explorer.kit import DecisionKit
 from sb3_momba.explorer.opening import open_kit, write_calibration
-from sb3_momba.explorer.prediction import CRITIC, FRONT, predictors_of, share_close
+from sb3_momba.explorer.prediction import CRITIC, FRONT, predictors_of, share_close, sizes
 from sb3_momba.explorer.reading import final_front, read_run
 from sb3_momba.explorer.rendering import Policy
-from sb3_momba.explorer.rollouts import Rollouts, critic_returns, entropy_bonus, roll_out
+from sb3_momba.explorer.rollouts import Rollouts, critic_excess, critic_values, roll_out
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
 from sb3_momba.records import read_record
 from tests.explorer_runs import TINY, fail, train_tiny, write_run
@@ -45,42 +46,82 @@ def test_rollouts_are_those_of_the_evaluation(vector_model):
     assert rollouts.behaviour.shape == (2, 2 * (env.observation_space.shape[0] + env.action_space.shape[0]))
 
 
-def test_the_entropy_bonus_by_hand(vector_model):
-    """gamma H_1 + gamma^2 H_2, and behind a time limit gamma^3 / (1 - gamma) of the mean entropy; alpha 0.1, scale 0.1."""
+@pytest.mark.parametrize(
+    ("n_steps", "terminated", "truncated"),
+    [
+        (
+            1,
+            0.99 * 2 + 0.99**2 * 3 + 0.99**3 * 5 + 0.99**4 * 7,
+            0.99 * 2 + 0.99**2 * 3 + 0.99**3 * 5 + 0.99**4 * 7 + 0.99**5 * 11,
+        ),
+        (3, 0.99**3 * 5, 0.99**3 * 5 + 0.99**5 * 11),
+    ],
+    ids=["n = 1", "n = 3"],
+)
+def test_what_a_critic_holds_beyond_the_return_by_hand(n_steps, terminated, truncated, vector_model):
+    """Entropies 1, 2, 3, 5, 7 and, in the state behind the last of five steps, 11, of which one counts for each bootstrap;
+    alpha and the scale are 0.1. Behind a time limit there is also gamma^5 Q of that state, (1, 2) / 0.1."""
     model = MOMBA.load(vector_model)
-    model.actor.action_log_prob = lambda s: (None, -model.policy.return_scale.max_return.new_tensor([5.0, 1.0, 3.0]))
-    observations, w = np.zeros((3, model.policy.observation_dim), dtype=np.float32), np.array([0.5, 0.5], dtype=np.float32)
-    alone = 0.99 * 1 + 0.99**2 * 3
-    assert entropy_bonus(model, observations, w, False) == pytest.approx(0.1 * alone / 0.1)
-    assert entropy_bonus(model, observations, w, True) == pytest.approx(0.1 * (alone + 0.99**3 / 0.01 * 3) / 0.1, rel=1e-5)
+    new_tensor = model.policy.return_scale.max_return.new_tensor
+    model.n_steps = n_steps
+    model.actor.action_log_prob = lambda s: (None, -new_tensor([1.0, 2.0, 3.0, 5.0, 7.0, 11.0]))
+    model.policy.value.mean = lambda _: new_tensor([[[1.0, 2.0]]])
+    observations, w = np.zeros((6, model.policy.observation_dim), dtype=np.float32), np.array([0.5, 0.5], dtype=np.float32)
+    np.testing.assert_allclose(critic_excess(model, observations, w, False), [terminated] * 2, rtol=1e-6)
+    expected = truncated + 0.99**5 * np.array([10.0, 20.0])
+    np.testing.assert_allclose(critic_excess(model, observations, w, True), expected, rtol=1e-6)
 
 
-def test_a_critics_returns_are_unscaled_and_less_the_bonus(vector_model):
+@pytest.mark.parametrize("n_steps", [1, 3], ids="n = {}".format)
+def test_a_critic_that_is_right_predicts_the_return_up_to_the_time_limit(n_steps, vector_model):
+    """A reward of (1, -2) and an entropy of 4 at each step, for ever: its Q is known, and so is the return of 50 steps."""
+    model = MOMBA.load(vector_model)
+    new_tensor, gamma = model.policy.return_scale.max_return.new_tensor, model.gamma
+    model.n_steps = n_steps
+    after = gamma**n_steps / (1 - gamma**n_steps)  # of an entropy of 1 at each bootstrap
+    value = 0.1 * np.array([1.0, -2.0]) / (1 - gamma) + 0.1 * 4 * after
+    model.actor.action_log_prob = lambda s: (None, new_tensor([-4.0] * len(s)))
+    model.policy.value.mean = lambda _: new_tensor(value)[None, None]
+    n = 51  # a multiple of 3
+    observations, w = np.zeros((n + 1, model.policy.observation_dim), dtype=np.float32), np.array([0.5, 0.5], dtype=np.float32)
+    predicted = critic_values(model, observations[:1], w[None])[0] - critic_excess(model, observations, w, True)
+    np.testing.assert_allclose(predicted, np.array([1.0, -2.0]) * (1 - gamma**n) / (1 - gamma), rtol=1e-5)
+
+
+def test_a_critics_values_are_unscaled(vector_model):
     """The mean over critics and starts of (1, 3) and (2, 4), divided by the scale 0.1."""
     model = MOMBA.load(vector_model)
     values = model.policy.return_scale.max_return.new_tensor([[[1.0, 2.0], [3.0, 4.0]]])
     model.policy.value.mean = lambda _: values.expand(4, 2, 2)
     starts = np.zeros((2, model.policy.observation_dim), dtype=np.float32)
-    found = critic_returns(model, starts, np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([1.0, 2.0]))
-    np.testing.assert_allclose(found, [[19.0, 29.0], [18.0, 28.0]])
+    np.testing.assert_allclose(critic_values(model, starts, np.array([[0.5, 0.5], [1.0, 0.0]])), [[20.0, 30.0]] * 2)
 
 
 def test_the_predictor_with_the_smaller_error_is_used(vector_model):
     model = MOMBA.load(vector_model)
     preferences = np.stack([np.linspace(0, 1, 5), np.linspace(1, 0, 5)], axis=1)
     starts = np.zeros((1, model.policy.observation_dim), dtype=np.float32)
-    expected = critic_returns(model, starts, preferences, np.full(5, 7.0))[:, None]
+    excess = np.array([7.0, -3.0]) * preferences[:, :1]
+    expected = (critic_values(model, starts, preferences) - excess)[:, None]
     noise = np.array([[0.0], [9.0], [-9.0], [9.0], [0.0]])[:, None]
     for returns, first in ((expected, CRITIC), (preferences[:, None] * 100, FRONT)):
         front = ParetoFront(preferences, returns, returns, np.ones((5, 1), dtype=np.int64))
-        surveyed = Rollouts(front, np.zeros((5, 2)), np.full(5, 7.0), starts)
+        surveyed = Rollouts(front, np.zeros((5, 2)), excess, starts)
         assert predictors_of(model, surveyed, front)[0].name == first
     noisy = ParetoFront(preferences, expected + noise, expected + noise, np.ones((5, 1), dtype=np.int64))
-    one = predictors_of(model, surveyed, noisy)[0]
-    assert one.name == CRITIC
-    np.testing.assert_allclose(one.errors, -np.broadcast_to(noise[:, 0], (5, 2)), atol=1e-4)
-    assert one.size(np.array([1.0, 3.0])) == pytest.approx(np.sqrt((3 * 81 + 3 * 9) / 10), rel=1e-4)
-    assert one.size(np.array([0.0, 1.0])) == pytest.approx(np.sqrt(3 * 81 / 5), rel=1e-4)  # in its own unit then
+    both = predictors_of(model, surveyed, noisy)
+    assert both[0].name == CRITIC
+    np.testing.assert_allclose(both[0].errors, -np.broadcast_to(noise[:, 0], (5, 2)), atol=1e-4)
+    assert sizes(both, np.array([1.0, 3.0]))[CRITIC] == pytest.approx(np.sqrt((81 + 9) / 2), rel=1e-4)
+    assert sizes(both, np.array([0.0, 1.0]))[CRITIC] == pytest.approx(9, rel=1e-4)  # in its own unit then
+    # The ends, of which interpolation knows no error, count for neither.
+    ends = expected + np.array([[1e3], [0.0], [0.0], [0.0], [1e3]])[:, None]
+    assert sizes(predictors_of(model, surveyed, ParetoFront(preferences, ends, ends, noisy.episode_lengths)), np.ones(2))[
+        CRITIC
+    ] == pytest.approx(0, abs=1e-3)
+    two = ParetoFront(preferences[::4], ends[::4], ends[::4], noisy.episode_lengths[::4])
+    assert predictors_of(model, surveyed, two)[0].name == FRONT
+    assert np.isnan([*sizes(predictors_of(model, surveyed, two), np.ones(2)).values()]).all()
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +131,22 @@ def run_folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def kit(run_folder, tmp_path_factory) -> Iterator[DecisionKit]:
-    with open_kit(run_folder, seeds=[run_folder], folder=tmp_path_factory.mktemp("kept")) as kit:
+    folder = tmp_path_factory.mktemp("kept")
+    with open_kit(run_folder, seeds=[other_seed_of(run_folder, folder / "other")], folder=folder) as kit:
         yield kit
+
+
+def other_seed_of(folder: Path, into: Path, gamma: float = 0.99, **changed: Any) -> Path:
+    """A run's record as that of the seed 1, whose front returned twice as much."""
+    first, *between, end = map(json.loads, (folder / "record.jsonl").read_text().splitlines())
+    first.update(seed=1)
+    first["config"].update(seed=1, **changed)
+    end["front"]["settings"]["gamma"] = gamma
+    for name in ("returns", "discounted_returns"):
+        end["front"][name] = (2 * np.array(end["front"][name])).tolist()
+    into.mkdir()
+    (into / "record.jsonl").write_text("".join(json.dumps(line) + "\n" for line in (first, *between, end)))
+    return into
 
 
 def test_the_final_front_is_the_records(run_folder):
@@ -109,7 +164,7 @@ def test_the_front_is_predicted_and_rolled_out_as_it_was_evaluated(kit):
     assert kit.run.front.preferences[0].tolist() == [0.0, 1.0]
     np.testing.assert_allclose(rollout["discounted"], kit.measured[0])
     np.testing.assert_allclose(rollout["returns"], kit.run.values[0])
-    np.testing.assert_allclose(kit.around(kit.check([0.0, 1.0]))["seeds"], [kit.measured[0]])
+    np.testing.assert_allclose(kit.around(kit.check([0.0, 1.0]))["seeds"], [2 * kit.measured[0]])
 
 
 def test_spread_is_the_deviation_over_episodes(kit, monkeypatch):
@@ -117,7 +172,9 @@ def test_spread_is_the_deviation_over_episodes(kit, monkeypatch):
     w = kit.check([0.4, 0.6])
     discounted = np.array([[[1.0, 3.0], [3.0, 7.0]]])
     front = ParetoFront(w[None], 10 * discounted, discounted, np.array([[5, 8]]))
-    monkeypatch.setitem(kit._rollouts, w.tobytes(), Rollouts(front, kit.survey.behaviour[:1], np.zeros(1), kit.survey.starts))
+    monkeypatch.setitem(
+        kit._rollouts, w.tobytes(), Rollouts(front, kit.survey.behaviour[:1], np.zeros((1, 2)), kit.survey.starts)
+    )
     shown = kit.show_rollout(w)
     assert (shown["n_episodes"], shown["steps"]) == (2, 6.5)
     for name, expected in (("discounted", [2, 5]), ("returns", [20, 50])):
@@ -140,6 +197,22 @@ def test_a_bound_is_met_in_the_rollout(kit):
     assert found["discounted"][0] >= here[0] - 1
 
 
+@pytest.mark.parametrize("elsewhere", [(20.0, 5.0), (0.0, 5.0)], ids=["kept but worse", "not kept"])
+def test_where_the_present_policy_is_the_best_it_stays(elsewhere, kit, monkeypatch):
+    """It returns (10, 10): with at most 1 less of the first, what the prediction prefers has less of the second."""
+    present = kit.check([0.5, 0.5])
+
+    def rolled_out(w):
+        returns = np.array([[(10.0, 10.0) if np.array_equal(w, present) else elsewhere]])
+        front = ParetoFront(w[None], returns, returns, np.ones((1, 1), dtype=np.int64))
+        return Rollouts(front, kit.survey.behaviour[:1], np.zeros((1, 2)), kit.survey.starts)
+
+    monkeypatch.setattr(kit, "rolled_out", rolled_out)
+    monkeypatch.setattr(kit, "candidate_returns", kit.candidates * 100)
+    found = kit.meet(present, 0, less=1.0)
+    assert (found["met"], found["at_least"], found["preference"], found["discounted"]) == (True, 9, present.tolist(), [10, 10])
+
+
 def test_a_bound_that_nothing_meets_gives_the_closest(kit):
     found = kit.meet(kit.check([0.5, 0.5]), 0, at_least=1e6)
     assert not found["met"]
@@ -150,9 +223,10 @@ def test_a_prediction_that_was_too_good_is_corrected(kit, monkeypatch):
     """Where the predictor promises too much, a bound is asked for more strictly, until the rollout keeps it."""
     target = float(np.quantile(kit.measured[:, 0], 0.6))
     monkeypatch.setattr(kit, "candidate_returns", kit.candidate_returns + np.array([0.3 * kit.ranges[0], 0]))
-    found = kit.meet(kit.check([0.1, 0.9]), 0, at_least=target)
+    asked = []
+    found = kit.meet(kit.check([0.1, 0.9]), 0, at_least=target, still_wanted=lambda: asked.append(1))
     assert found["met"]
-    assert found["n_rollouts"] > 1
+    assert len(asked) > 2  # the present preference, one that did not keep it, and more
     assert found["discounted"][0] >= target
     assert found["preference"] not in kit.front.preferences.tolist()  # It was searched for, not only looked up.
 
@@ -172,9 +246,13 @@ def test_what_is_kept_acts_as_the_page_did(kit):
         shown, _ = kit.model.predict(observation, preference=w, deterministic=True)
         (one,) = session.run(["action"], {"observation": observation[None].astype(np.float32)})
         np.testing.assert_allclose(one[0], shown, atol=1e-5)
-        np.testing.assert_array_equal(loaded.predict(observation, preference=w, deterministic=True)[0], shown)
+        np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], shown)
         observation, *_ = env.step(shown)
-    assert loaded.preference_sampler == w.tolist()
+    other = [0.7, 0.3]
+    np.testing.assert_array_equal(
+        loaded.predict(observation, preference=other, deterministic=True)[0],
+        kit.model.predict(observation, preference=other, deterministic=True)[0],
+    )
     assert kit.model.preference_sampler is None
 
 
@@ -184,7 +262,7 @@ def test_a_model_alone_is_surveyed(vector_model, monkeypatch):
         assert {one.name for one in kit.predictors} == {FRONT, CRITIC}
         assert kit.no_film == "none are wanted"
         assert kit.objectives == ["forward speed", "jumping height"]
-        begins = {FRONT: "Interpolated between the 41", CRITIC: "Predicted by the vector critic less its entropy bonus"}
+        begins = {FRONT: "Interpolated between the 41", CRITIC: "Predicted by the vector critic, less entropy"}
         for predictors in (kit.predictors, kit.predictors[::-1]):
             monkeypatch.setattr(kit, "predictors", predictors)
             assert kit.about_prediction().startswith(begins[predictors[0].name])
@@ -222,7 +300,18 @@ def test_what_cannot_be_chosen_from_is_refused(run_folder, vector_model, tmp_pat
     fail(["live", with_model(one_point, vector_model)], "has one point")
     other = write_run(tmp_path / "other", values, np.eye(2), env="MO-HalfCheetah-v4")
     fail(["live", with_model(other, vector_model)], "observation_space has shape")
-    fail(["live", run_folder, "--seeds", other], "not of .* on MO-Hopper-v4")
+    fail(["live", run_folder, "--seeds", other], "a run of MO-HalfCheetah-v4, not of MO-Hopper-v4")
+    fail(["live", run_folder, "--seeds", run_folder], "is the run itself")
+    fail(["live", run_folder, "--seeds", write_run(tmp_path / "same", values, np.eye(2))], "no discounted returns")
+    twin = shutil.copytree(run_folder, tmp_path / "twin")
+    fail(["live", run_folder, "--seeds", twin], "has the seed 0 too")
+    longer = other_seed_of(run_folder, tmp_path / "longer", steps=600)
+    fail(["live", run_folder, "--seeds", longer], "differs by more than its seed: steps is 600.0 instead of 300.0")
+    alone = ["live", vector_model, "--env", "MO-Hopper-v4", "--seeds"]
+    fail(
+        [*alone, other_seed_of(run_folder, tmp_path / "shorter-sighted", gamma=0.9)],
+        "differs by more than its seed: gamma is 0.9 instead of 0.99",
+    )
     fail(["calibrate", run_folder, "--preferences", "0"], "give at least 1")
 
 

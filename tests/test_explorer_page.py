@@ -8,8 +8,8 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from sb3_momba.explorer.report import write_report
-from tests.explorer_browser import OPTIONS, PHONE, Watched, text, wait_until
-from tests.explorer_runs import chromium, needs_browser, needs_gl, simplex, train_tiny, write_run
+from tests.explorer_browser import OPTIONS, PHONE, Watched, click_on_point, text, wait_until
+from tests.explorer_runs import NUMBERS, chromium, needs_browser, needs_gl, simplex, train_tiny, write_run
 
 pytestmark = needs_browser
 
@@ -47,6 +47,32 @@ def opened(watched) -> Iterator[Page]:
     watched.check()
 
 
+def test_numbers_are_written_as_in_python(opened):
+    assert opened.evaluate("(numbers) => numbers.map(explorer.number)", list(NUMBERS)) == list(NUMBERS.values())
+    assert opened.evaluate("explorer.number(-0)") == "0"
+
+
+@needs_gl
+def test_films_share_one_loop(opened):
+    """However many are shown, the page asks for one frame at a time."""
+    for _ in range(3):
+        for key in ("End", "Home"):
+            opened.keyboard.press(key)
+            wait_until(opened, "document.getElementById('film').currentTime > 0.05")
+    asked = opened.evaluate("""new Promise((done) => {
+        const before = window.requestAnimationFrame;
+        let asked = 0, frames = 0;
+        window.requestAnimationFrame = (call) => { asked += 1; return before.call(window, call); };
+        const count = () => {
+            frames += 1;
+            if (frames < 10) return before.call(window, count);
+            window.requestAnimationFrame = before;
+            done(asked / frames);
+        };
+        before.call(window, count); })""")
+    assert 0 < asked < 1.5
+
+
 @needs_gl
 def test_the_slider_changes_the_film(opened):
     source, shown = opened.get_attribute("#film", "src"), text(opened, "#film-caption")
@@ -79,17 +105,11 @@ def test_the_film_plays_and_the_return_runs_with_it(opened):
 
 def test_a_click_selects_a_point(opened):
     """Also one that was not filmed: the nearest film is shown, and says so."""
-    point = 1
-    x, y = opened.evaluate(f"""() => {{
-        const chart = document.getElementById("front");
-        const values = JSON.parse(document.getElementById("data").textContent).runs[0].values[{point}];
-        const box = chart.getBoundingClientRect(), {{ xaxis, yaxis }} = chart._fullLayout;
-        return [box.left + xaxis._offset + xaxis.d2p(values[0]), box.top + yaxis._offset + yaxis.d2p(values[1])]; }}""")
-    opened.mouse.click(x, y)
+    values = opened.evaluate("JSON.parse(document.getElementById('data').textContent).runs[0].values[1]")
+    click_on_point(opened, values)
     opened.wait_for_selector("#preference-text:text-is('0.25 / 0.75')")
     assert text(opened, "#points tr[aria-current] th") == "0.25 / 0.75"
     marked = opened.evaluate("(() => { const t = document.getElementById('front').data.at(-1); return [t.x[0], t.y[0]]; })()")
-    values = opened.evaluate(f"JSON.parse(document.getElementById('data').textContent).runs[0].values[{point}]")
     assert marked == values
 
 

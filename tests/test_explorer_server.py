@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -70,6 +71,7 @@ def test_only_the_page_is_answered(server):
     assert request(server, "/predict", question, {"Origin": "http://evil.example"})[0] == 403
     assert request(server, "/predict", question, {"Content-Type": "text/plain"})[0] == 415
     assert request(server, "/predict", b"x" * 70_000)[0] == 413
+    assert request(server, "/predict", b"x", {"Content-Length": "9" * 5_000})[0] == 413
     assert request(server, "/predict")[0] == 404
 
 
@@ -100,6 +102,30 @@ def test_bad_questions_are_refused(path, question, words, server):
     status, error = error_of(request(server, path, question))
     assert status == 400
     assert words in error
+
+
+@pytest.mark.parametrize(
+    "error", [KeyError("joint"), AssertionError(), ValueError("inside")], ids=lambda error: type(error).__name__
+)
+def test_what_fails_inside_is_no_fault_of_the_question(error, server, kit, monkeypatch, caplog):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(kit, "show_rollout", fail)
+    answer = request(server, "/rollout", {"preference": [0.5, 0.5]})
+    assert error_of(answer) == (500, f"{type(error).__name__}: {error}")
+    assert "/rollout failed." in caplog.text
+
+
+def test_a_model_that_was_written_anew_is_not_rolled_out(server, kit):
+    path = kit.run.policy.path
+    before = path.stat()
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1_000_000_000))
+    answer = request(server, "/rollout", {"preference": [0.123, 0.877]})
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    status, error = error_of(answer)
+    assert status == 500
+    assert f"{path} was written anew" in error
 
 
 def test_predictions_come_in_time(server):

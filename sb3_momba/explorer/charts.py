@@ -6,6 +6,7 @@ Every string that comes from a record goes through `as_label`: Plotly reads HTML
 
 import html
 from collections.abc import Sequence
+from decimal import ROUND_HALF_UP, Context, Decimal
 from typing import Any
 
 import numpy as np
@@ -34,11 +35,17 @@ def as_label(text: str) -> str:
 
 
 def number(x: float) -> str:
-    """Four digits, as people write them: 0.1234, 12.34, 1,234, 1.234 M."""
+    """Four digits, as people write them: 0.1234, 12.34, 1,234, 1.234 M; common.js has the same, whose ties go away from 0."""
     for size, unit in ((1e12, ""), (1e9, " G"), (1e6, " M")):
         if abs(x) >= size:
-            return f"{x:.3e}" if size == 1e12 else f"{x / size:.4g}{unit}"
-    return f"{x:,.0f}" if abs(x) >= 1_000 else f"{x:.4g}" if x == 0 or abs(x) >= 1e-3 else f"{x:.1e}"
+            return f"{_rounded(x, 4):.3e}" if size == 1e12 else f"{_rounded(x / size, 4):.4g}{unit}"
+    if abs(x) >= 1_000:
+        return f"{Decimal(x).quantize(Decimal(1), ROUND_HALF_UP):,}"
+    return f"{_rounded(x, 4):.4g}" if x == 0 or abs(x) >= 1e-3 else f"{_rounded(x, 2):.1e}".replace("e-0", "e-")
+
+
+def _rounded(x: float, digits: int) -> float:
+    return float(Context(digits, ROUND_HALF_UP).create_decimal(x)) + 0.0
 
 
 def colour_of(run: int) -> str:

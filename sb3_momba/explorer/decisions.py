@@ -19,6 +19,7 @@ N_NEAREST = 4  # evaluated preferences whose errors speak for a place between th
 STEP = 0.05  # of a weight, over which slopes are taken: below that, one sees the noise of single policies
 SMALLEST_TRADE = 1e-3  # of the front's range: less is no change that a price could be named for
 N_ALTERNATIVES = 3
+LEAST_DIFFERENCE = 0.5  # of an average pair's: what counts as moving differently
 
 
 def predict_returns(wanted: Array, preferences: Array, returns: Array) -> Array:
@@ -101,23 +102,23 @@ def local_error(wanted: Array, preferences: Array, errors: Array) -> Array:
 
 
 def exchange_rates(predict: Predict, preference: Array, ranges: Array) -> Array:
-    """What one unit less of an objective buys in another one, where a little weight goes from the first to the second: the
-    slope of the front between the policies on both sides of the preference.
+    """What one unit less of an objective buys, where a little weight goes from it to another one: the slope of the front
+    between the policies on both sides of the preference, in every objective.
 
     :param preference: (n_objectives,)
     :param ranges: how far each objective's return reaches over the front, (n_objectives,)
-    :return: (n_objectives, n_objectives): gained of the column's objective for one less of the row's; NaN where such a shift
-        does not take from one and give to the other
+    :return: (n_objectives, n_objectives, n_objectives): [i, j] is the change for one less of i where weight goes to j, -1 at
+        i; NaN where such a shift does not take from i and give to j
     """
     n = len(preference)
-    rates = np.full((n, n), np.nan)
+    rates = np.full((n, n, n), np.nan)
     for given, gained in ((i, j) for i in range(n) for j in range(n) if i != j):
         direction = np.eye(n)[gained] - np.eye(n)[given]
         ahead, back = min(STEP, preference[given]), min(STEP, preference[gained])
         ends = predict(np.stack([preference - back * direction, preference + ahead * direction]))
         change = ends[1] - ends[0]
         if -change[given] > SMALLEST_TRADE * ranges[given] and change[gained] > SMALLEST_TRADE * ranges[gained]:
-            rates[given, gained] = change[gained] / -change[given]
+            rates[given, gained] = change / -change[given]
     return rates
 
 
@@ -171,8 +172,8 @@ class Alternative:
 def find_alternatives(
     returns: Array, behaviour: Array, others_returns: Array, others_behaviour: Array, tolerance: Array
 ) -> list[Alternative]:
-    """Of the policies whose returns lie within a tolerance in every objective, those that move most differently, the most
-    different first.
+    """Of the policies whose returns lie within a tolerance in every objective, those that move differently, the most different
+    first: at least half as far away as an average pair of the policies.
 
     A behaviour is a row of statistics, such as the mean of each action; each statistic is divided by its standard deviation
     over all policies, and two behaviours are as far apart as the root mean square of their differences.
@@ -190,6 +191,6 @@ def find_alternatives(
     n = len(scaled)
     average = pairs.sum() / max(n * (n - 1), 1)
     distances = np.sqrt(((scaled - here) ** 2).mean(axis=1)) / (average if average > 0 else 1)
-    alike = np.flatnonzero((np.abs(others_returns - returns) <= tolerance).all(axis=1) & (distances > TOLERANCE))
+    alike = np.flatnonzero((np.abs(others_returns - returns) <= tolerance).all(axis=1) & (distances >= LEAST_DIFFERENCE))
     order = alike[(-distances[alike]).argsort(kind="stable")][:N_ALTERNATIVES]
     return [Alternative(int(i), float(distances[i]), int(np.abs(scaled[i] - here).argmax())) for i in order]

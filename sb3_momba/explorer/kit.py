@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sb3_momba import MOMBA, __version__
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.explorer.decisions import Bound, exchange_rates, find_alternatives, predict_returns, rank_for_bound
-from sb3_momba.explorer.prediction import CRITIC, FRONT, Predictor, predictors_of
+from sb3_momba.explorer.prediction import CRITIC, FRONT, Predictor, predictors_of, sizes
 from sb3_momba.explorer.reading import Run, objectives_of
 from sb3_momba.explorer.rendering import Film, RenderingProcess, film
 from sb3_momba.explorer.rollouts import Rollouts, roll_out
@@ -24,14 +24,18 @@ from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.protocol import N_EPISODES
 
 Array = NDArray[np.float64]
+Result = TypeVar("Result")
 
-N_CANDIDATES = {2: 1_001}  # preferences among which a bound is searched, by the number of objectives
-OTHER_CANDIDATES = 300
+N_ON_LINE, N_ON_SIMPLEX = 1_001, 300  # preferences among which a bound is searched, of two and of more objectives
 MAX_TRIES = 4
 LIKE = 0.05  # of the front's range in each objective: returns that count as like
 MOST_KEPT = 256  # rollouts that are remembered
 
 logger = logging.getLogger(__name__)
+
+
+class QuestionError(ValueError):
+    """A question that cannot be answered as it is; the message says how it can."""
 
 
 @dataclass
@@ -59,15 +63,16 @@ class DecisionKit:
     def __post_init__(self) -> None:
         assert self.run.front is not None
         self.front = self.run.front
-        self.measured: Array = self.front.discounted_returns.mean(axis=1)
+        self.measured: Array = self.front.discounted_values
         self.ranges: Array = np.ptp(self.measured, axis=0)
         self.objectives = objectives_of(self.run.record)
         self.predictors = predictors_of(self.model, self.survey, self.front)
         n = len(self.objectives)
-        grid = preference_grid(n, N_CANDIDATES.get(n, OTHER_CANDIDATES))
+        grid = preference_grid(n, N_ON_LINE if n == 2 else N_ON_SIMPLEX)
         self.candidates: Array = np.concatenate([grid, self.front.preferences])
         self.candidate_returns = self.predictor.predict(self.candidates)
         self._saving = threading.Lock()
+        self._written = self.run.policy.path.stat().st_mtime_ns
 
     @property
     def predictor(self) -> Predictor:
@@ -83,24 +88,30 @@ class DecisionKit:
 
     def about_prediction(self) -> str:
         """Which predictor is used, and how well it does."""
-        used, n = self.predictor, len(self.front.preferences)
-        errors = {one.name: f"{100 * one.size(self.ranges):.1f} %" for one in self.predictors}
-        if used.name == FRONT:
-            text = f"Interpolated between the {n} evaluated preferences. Each of them, predicted from the others, is off by "
-            text += f"{errors[FRONT]} of the front's range"
-            if CRITIC in errors:
-                text += f"; the vector critic less its entropy bonus is off by {errors[CRITIC]}, and is not used"
-            return text + "."
-        return (
-            f"Predicted by the vector critic less its entropy bonus, which is off by {errors[CRITIC]} of the front's range at "
-            f"the {n} evaluated preferences; interpolating between them is off by {errors[FRONT]}."
-        )
+        n, known = len(self.front.preferences), sizes(self.predictors, self.ranges)
+        errors = {name: f"{100 * size:.1f} %" for name, size in known.items() if np.isfinite(size)}
+        critic = "vector critic, less entropy and what lies behind time limits,"
+        if self.predictor.name == CRITIC:
+            return (
+                f"Predicted by the {critic} which is off by {errors[CRITIC]} of the front's range at those of the {n} "
+                f"evaluated preferences that lie between others; interpolating between these is off by {errors[FRONT]}."
+            )
+        text = f"Interpolated between the {n} evaluated preferences. "
+        if not errors:
+            return text + "How far that is off is not known: none of them lies between others."
+        text += f"Those that lie between others, predicted from these, are off by {errors[FRONT]} of the front's range"
+        if CRITIC in errors:
+            text += f"; the {critic} is off by {errors[CRITIC]} there, and is not used"
+        return text + "."
 
     def check(self, preference: Any) -> Array:
-        """:raises ValueError: for what is no preference of this model"""
-        if not isinstance(preference, list) or np.ndim(preference) != 1:
-            raise ValueError(f"preference is {preference!r}: give a list of {len(self.objectives)} weights.")
-        return check_preference(preference, len(self.objectives)).astype(np.float64)
+        """:raises QuestionError: for what is no preference of this model"""
+        try:
+            if isinstance(preference, list) and np.ndim(preference) == 1:
+                return check_preference(preference, len(self.objectives)).astype(np.float64)
+        except (ValueError, TypeError) as error:
+            raise QuestionError(str(error)) from error
+        raise QuestionError(f"preference is {preference!r}: give a list of {len(self.objectives)} weights.")
 
     def predict(self, preference: Array) -> dict[str, Any]:
         """The discounted return expected of each objective, and its error."""
@@ -112,14 +123,21 @@ class DecisionKit:
         }
 
     def around(self, preference: Array) -> dict[str, Any]:
-        """Exchange rates, and what the same preference returns after trainings with other seeds."""
+        """What trades cost, and what the same preference returns after trainings with other seeds."""
         rates = exchange_rates(self.predictor.predict, preference, self.ranges)
-        seeds = [predict_returns(preference[None], s.preferences, s.discounted_returns.mean(axis=1))[0] for s in self.seeds]
+        seeds = [predict_returns(preference[None], s.preferences, s.discounted_values)[0] for s in self.seeds]
         return {"preference": preference.tolist(), "rates": finite(rates), "seeds": [one.tolist() for one in seeds]}
 
     def roll_out(self, preferences: Array, n_episodes: int = N_EPISODES) -> Rollouts:
         """Episodes from the seed of the run's evaluation on."""
-        return self.process.call(roll_out, self.run.policy, preferences, n_episodes, self.seed)
+        return self._in_process(roll_out, preferences, n_episodes, self.seed)
+
+    def _in_process(self, function: Callable[..., Result], *arguments: Any) -> Result:
+        """:raises RuntimeError: where the model's file is not the one any more that predicts and is kept"""
+        path = self.run.policy.path
+        if path.stat().st_mtime_ns != self._written:
+            raise RuntimeError(f"{path} was written anew since this page was opened: end the server and start it again.")
+        return self.process.call(function, self.run.policy, *arguments)
 
     @property
     def seed(self) -> int:
@@ -146,7 +164,7 @@ class DecisionKit:
         several = n_episodes > 1
         return {
             "preference": preference.tolist(),
-            "discounted": front.discounted_returns[0].mean(axis=0).tolist(),
+            "discounted": front.discounted_values[0].tolist(),
             "discounted_spread": front.discounted_returns[0].std(axis=0, ddof=1).tolist() if several else None,
             "returns": front.values[0].tolist(),
             "spread": front.returns[0].std(axis=0, ddof=1).tolist() if several else None,
@@ -155,9 +173,9 @@ class DecisionKit:
         }
 
     def _alternatives(self, here: Rollouts) -> list[dict[str, Any]]:
-        returns = self.survey.front.discounted_returns.mean(axis=1)
+        returns = self.survey.front.discounted_values
         behaviour, others = here.behaviour[0], self.survey.behaviour
-        found = find_alternatives(here.front.discounted_returns[0].mean(axis=0), behaviour, returns, others, LIKE * self.ranges)
+        found = find_alternatives(here.front.discounted_values[0], behaviour, returns, others, LIKE * self.ranges)
         return [
             {
                 "preference": self.survey.front.preferences[one.index].tolist(),
@@ -184,7 +202,7 @@ class DecisionKit:
         """
         if self.no_film:
             raise RenderingError(self.no_film)
-        return self.process.call(film, self.run.policy, preference, 0, self.seed, self.process.backend)
+        return self._in_process(film, preference, 0, self.seed, self.process.backend)
 
     def meet(
         self,
@@ -194,59 +212,48 @@ class DecisionKit:
         less: float | None = None,
         still_wanted: Callable[[], None] = lambda: None,
     ) -> dict[str, Any]:
-        """The preference that keeps a bound on the discounted return of an objective and has the most of the others, searched
-        on the predictor and proved by a rollout; or the one that comes closest.
+        """The preference that keeps a bound on the discounted return of an objective and has the most of the others: searched
+        on the predictor, and of all that were rolled out, the present one among them, the best; or, where none keeps it, the
+        one that comes closest.
 
         :param objective: its number
         :param at_least: the bound; or
         :param less: at most so much less than the present preference returns
         :param still_wanted: called before each rollout; may raise
         """
-        n_rollouts = 0
+        preferences: list[Array] = []
+        returns: list[Array] = []
 
-        def measured(w: Array) -> Array:
-            nonlocal n_rollouts
+        def value_of(w: Array) -> float:
             still_wanted()
-            n_rollouts += 1
-            return np.asarray(self.rolled_out(w).front.discounted_returns[0].mean(axis=0))
+            w = self.check(w.tolist())  # as it comes back from the page
+            preferences.append(w)
+            returns.append(self.rolled_out(w).front.discounted_values[0])
+            return float(returns[-1][objective])
 
+        here = value_of(preference)
         if less is not None:
-            at_least = float(measured(preference)[objective]) - less
+            at_least = here - less
         assert at_least is not None
-        bound, asked = Bound(objective, at_least), at_least
-        tried: list[tuple[float, Array]] = []
-
-        def keeps(w: Array) -> bool:
-            value = float(measured(w)[objective])
-            tried.append((value, w))
-            return value >= bound.at_least
-
+        bound = asked = Bound(objective, at_least)
+        missing = np.inf
         for _ in range(MAX_TRIES):
-            order = rank_for_bound(Bound(objective, asked), preference, self.candidates, self.candidate_returns)
+            order = rank_for_bound(asked, preference, self.candidates, self.candidate_returns)
             if len(order) == 0:
                 break
-            if keeps(self._exact(self.candidates[order[0]])):
-                return self._answer(True, bound, tried[-1][1], n_rollouts)
-            asked += bound.at_least - tried[-1][0]
-        evaluated = rank_for_bound(bound, preference, self.front.preferences, self.measured)[:MAX_TRIES]
-        closest = self.measured[:, objective].argmax()
-        for k in [*evaluated, closest]:
-            if keeps(self._exact(self.front.preferences[k])):
-                return self._answer(True, bound, tried[-1][1], n_rollouts)
-        return self._answer(False, bound, max(tried, key=lambda one: one[0])[1], n_rollouts)
-
-    def _exact(self, preference: Array) -> Array:
-        """As it comes back from the page."""
-        return self.check(preference.tolist())
-
-    def _answer(self, met: bool, bound: Bound, preference: Array, n_rollouts: int) -> dict[str, Any]:
-        return {
-            "met": met,
-            "objective": bound.objective,
-            "at_least": bound.at_least,
-            "n_rollouts": n_rollouts,
-            **self._measured(preference),
-        }
+            missing = at_least - value_of(self.candidates[order[0]])
+            if missing <= 0:
+                break
+            asked = Bound(objective, asked.at_least + missing)
+        if missing > 0:
+            evaluated = rank_for_bound(bound, preference, self.front.preferences, self.measured)[:MAX_TRIES]
+            for k in [*evaluated, self.measured[:, objective].argmax()]:
+                if value_of(self.front.preferences[k]) >= at_least:
+                    break
+        kept = rank_for_bound(bound, preference, np.array(preferences), np.array(returns))
+        chosen = int(kept[0]) if len(kept) > 0 else int(np.array(returns)[:, objective].argmax())
+        answer = self._measured(preferences[chosen])
+        return {"met": len(kept) > 0, "objective": objective, "at_least": at_least, **answer}
 
     def keep(self, preference: Array) -> dict[str, Any]:
         """Write the policy with this preference built in: policy.onnx, which needs no preference, model.zip, whose preference
@@ -269,9 +276,14 @@ class DecisionKit:
                 notes.append(str(error))
             known = self._rollouts.get(preference.tobytes())
             choice = {
-                **{"preference": preference.tolist(), "objectives": self.objectives, "env": self.run.record.env},
-                **{"env_kwargs": self.run.record.env_kwargs, "model": str(self.run.policy.path), "sb3_momba": __version__},
-                **{"predicted": self.predict(preference), "predictor": self.predictor.name},
+                "preference": preference.tolist(),
+                "objectives": self.objectives,
+                "env": self.run.record.env,
+                "env_kwargs": self.run.record.env_kwargs,
+                "model": str(self.run.policy.path),
+                "sb3_momba": __version__,
+                "predicted": self.predict(preference),
+                "predictor": self.predictor.name,
                 "rollouts": None if known is None else self._measured(preference),
             }
             with atomic_write(folder / "choice.json") as file:

@@ -9,6 +9,7 @@ import html
 import ipaddress
 import json
 import logging
+import re
 import socket
 import sys
 import threading
@@ -20,16 +21,14 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import torch as th
 
 from sb3_momba import __version__
 from sb3_momba.explorer import charts
-from sb3_momba.explorer.kit import DecisionKit
+from sb3_momba.explorer.kit import DecisionKit, QuestionError
 from sb3_momba.explorer.opening import open_kit
 from sb3_momba.explorer.rendering import FPS
 from sb3_momba.explorer.report import fill, film_numbers, json_in_html, page_file, plotly_script
-from sb3_momba.explorer.stage import RenderingError
 
 HOST, PORT = "127.0.0.1", 8765
 LONGEST_REQUEST = 65_536  # bytes
@@ -137,20 +136,20 @@ class LiveServer(ThreadingHTTPServer):
     def _bound(self, asked: dict[str, Any]) -> dict[str, Any]:
         preference, objective = self.kit.check(asked.get("preference")), asked.get("objective")
         if type(objective) is not int or not 0 <= objective < len(self.kit.objectives):
-            raise ValueError(f"objective is {objective!r}: give a number from 0 to {len(self.kit.objectives) - 1}.")
+            raise QuestionError(f"objective is {objective!r}: give a number from 0 to {len(self.kit.objectives) - 1}.")
         given = {name: number_of(asked[name], name) for name in ("at_least", "less") if name in asked}
         if len(given) != 1:
-            raise ValueError("Give one of at_least and less.")
+            raise QuestionError("Give one of at_least and less.")
         with self.rollouts.turn() as still_wanted:
             return self.kit.meet(preference, objective, **given, still_wanted=still_wanted)
 
 
 def number_of(x: Any, name: str) -> float:
-    """:raises ValueError: for what is no finite number, or a negative `less`"""
+    """:raises QuestionError: for what is no finite number, or a negative `less`"""
     if isinstance(x, bool) or not isinstance(x, int | float) or not abs(x) < 1e300:
-        raise ValueError(f"{name} is {x!r}: give a number.")
+        raise QuestionError(f"{name} is {x!r}: give a number.")
     if name == "less" and x < 0:
-        raise ValueError(f"less is {x}: give 0 or more.")
+        raise QuestionError(f"less is {x}: give 0 or more.")
     return float(x)
 
 
@@ -183,19 +182,23 @@ class Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, "There is no such action.")
             return
         try:
-            self._send(HTTPStatus.OK, "application/json", self._answer(action, body))
-        except (ValueError, TypeError) as error:
+            answer = self._answer(action, body)
+        except QuestionError as error:
             self._refuse(HTTPStatus.BAD_REQUEST, str(error))
-        except ConnectionError:
-            self.close_connection = True  # The page was closed meanwhile.
-        except (RenderingError, OSError, RuntimeError, ImportError, gym.error.Error) as error:
-            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        except Exception as error:  # Environments raise what they like, and the page must hear of it.
+            logger.exception("%s failed.", self.path)
+            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}")
+        else:
+            self._send(HTTPStatus.OK, "application/json", answer)
 
     def _answer(self, action: Callable[[dict[str, Any]], dict[str, Any]], body: bytes) -> bytes:
         start = time.perf_counter()
-        asked = json.loads(body)
+        try:
+            asked = json.loads(body)
+        except ValueError as error:
+            raise QuestionError(f"The request is no JSON: {error}") from error
         if not isinstance(asked, dict):
-            raise ValueError("The request is no JSON object.")
+            raise QuestionError("The request is no JSON object.")
         try:
             answer = action(asked)
         except SupersededError:  # No error: browsers would log one.
@@ -205,7 +208,7 @@ class Handler(BaseHTTPRequestHandler):
     def _body(self) -> bytes | None:
         """Of a request that may be answered; the others are refused here."""
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > LONGEST_REQUEST:
+        if not re.fullmatch("[0-9]{1,9}", length) or int(length) > LONGEST_REQUEST:
             self.close_connection = True  # Its body is not read.
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"A request has at most {LONGEST_REQUEST} bytes.")
             return None
@@ -249,9 +252,12 @@ def page_of(kit: DecisionKit) -> str:
     front = charts.front([kit.as_run()], kit.objectives, "discounted return")
     for trace in front["data"]:
         trace["name"] = "evaluated"
-    for name, symbol in (("predicted", "circle-open"), ("rollout", "diamond-open")):
+    for name, symbol, dash in (("predicted", "circle-open", "dot"), ("rollout", "diamond-open", "solid")):
         mark = charts.selection(len(kit.objectives))
-        front["data"].append({**mark, "name": name, "showlegend": True, "marker": {**mark["marker"], "symbol": symbol}})
+        line = {**mark["line"], "dash": dash}
+        front["data"].append(
+            {**mark, "name": name, "showlegend": True, "line": line, "marker": {**mark["marker"], "symbol": symbol}}
+        )
     front["layout"]["showlegend"] = True
     front["layout"]["legend"]["itemsizing"] = "constant"
     numbers = {

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_momba import MOMBA
+from sb3_momba.benchmark.results import method_settings
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.explorer.kit import DecisionKit
 from sb3_momba.explorer.prediction import Calibration, calibrate, draw_calibration
@@ -55,15 +56,14 @@ def open_kit(
             f"The front of {path} has one point, of the preference {run.front.preferences[0].tolist()}: there is nothing to "
             "choose between. Give a run that was evaluated under several preferences, or its model.zip with --env."
         )
-    others = [other_seed(one, run) for one in seeds]
+    others = [other_seed(one, run, model.gamma) for one in seeds]
     no_film, process = start_process(run) if films else ("none are wanted", RenderingProcess(needs_gl=False))
     with process:
         process.call(be_nice)
         grid = preference_grid(n_objectives, N_SURVEYED).astype(np.float32).astype(np.float64)
-        n_episodes = N_EPISODES if run.front is None else 1
         logger.info("Rolling out %d preferences ...", len(grid))
         seed = 0 if run.front is None else int(run.front.settings.get("seed", 0))
-        survey = process.call(roll_out, run.policy, grid, n_episodes, seed)
+        survey = process.call(roll_out, run.policy, grid, N_EPISODES, seed)
         if run.front is None:
             run.front, run.values = survey.front, survey.front.values
         yield DecisionKit(run, model, process, no_film, survey, others, folder or run.policy.path.parent / "kept")
@@ -86,19 +86,29 @@ def model_alone(path: Path, env: str) -> Run:
     return Run(path.stem, record, np.zeros((n, n)), None, path)
 
 
-def other_seed(folder: Path, run: Run) -> ParetoFront:
-    """The front of another run of the same method.
+def other_seed(folder: Path, run: Run, gamma: float) -> ParetoFront:
+    """The front of a run that differs from another one by its seed alone; from a model without a record, as far as can be seen.
 
-    :raises ValueError: for a run of another task or method, or without a front
+    :param gamma: of the model
+    :raises ValueError: for a run of another task or method or of the same seed, or without a front, saying what differs
     """
     other = read_run(folder)
-    if other.record.task != run.record.task or other.record.label != run.record.label:
-        raise ValueError(
-            f"--seeds {folder} is a run of {other.record.label} on {other.record.task}, not of {run.record.label} on "
-            f"{run.record.task}: their spread would not be that of seeds."
-        )
+    if folder.resolve() == run.policy.path.parent:
+        raise ValueError(f"--seeds {folder} is the run itself: give runs with other seeds.")
+    if other.record.task != run.record.task:
+        raise ValueError(f"--seeds {folder} is a run of {other.record.task}, not of {run.record.task}.")
     if other.front is None:
         raise ValueError(f"--seeds {folder} has no discounted returns of a finished run: leave it out.")
+    if run.record.config:
+        if other.record.seed == run.record.seed:
+            raise ValueError(f"--seeds {folder} has the seed {run.record.seed} too: give runs with other seeds.")
+        ours, theirs = ({"label": one.record.label, **method_settings(one.record)} for one in (run, other))
+    else:
+        ours, theirs = {"gamma": gamma}, {"gamma": other.front.settings.get("gamma", gamma)}
+    differing = [name for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]
+    if differing:
+        texts = ", ".join(f"{name} is {theirs.get(name)!r} instead of {ours.get(name)!r}" for name in differing)
+        raise ValueError(f"--seeds {folder} differs by more than its seed: {texts}.")
     return other.front
 
 

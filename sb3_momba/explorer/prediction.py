@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sb3_momba import MOMBA
 from sb3_momba.explorer.decisions import Predict, leave_one_out_errors, local_error, predict_returns
-from sb3_momba.explorer.rollouts import Rollouts, critic_returns
+from sb3_momba.explorer.rollouts import Rollouts, critic_values
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.plotting import COLOURS, verbatim
@@ -39,16 +39,21 @@ class Predictor:
         """Root mean square of the errors nearby, (n, n_objectives); NaN if none is known."""
         return local_error(wanted, self.preferences, self.errors)
 
-    def size(self, ranges: Array) -> float:
-        """Root mean square of all known errors, as a share of how far each objective reaches, (n_objectives,), over the front;
-        infinite if none is known."""
-        known = self.errors[np.isfinite(self.errors).all(axis=1)] / np.where(ranges > 0, ranges, 1)
-        return float(np.sqrt((known**2).mean())) if known.size else np.inf
+
+def sizes(predictors: Sequence[Predictor], ranges: Array) -> dict[str, float]:
+    """Root mean square of each predictor's errors, by its name, at the preferences where all predictors' are known; as a share
+    of how far each objective reaches, (n_objectives,), over the front. NaN if there is no such preference.
+
+    :param predictors: with errors at the same preferences
+    """
+    known = np.all([np.isfinite(one.errors).all(axis=1) for one in predictors], axis=0)
+    unit = np.where(ranges > 0, ranges, 1)
+    return {one.name: float(np.sqrt(((one.errors[known] / unit) ** 2).mean())) if known.any() else np.nan for one in predictors}
 
 
 def front_predictor(front: ParetoFront) -> Predictor:
     """Interpolation of an evaluated front; its errors are those of leaving one preference out."""
-    measured = front.discounted_returns.mean(axis=1)
+    measured = front.discounted_values
 
     def predict(wanted: Array) -> Array:
         return predict_returns(wanted, front.preferences, measured)
@@ -57,23 +62,24 @@ def front_predictor(front: ParetoFront) -> Predictor:
 
 
 def critic_predictor(model: MOMBA, rollouts: Rollouts, front: ParetoFront) -> Predictor:
-    """A vector critic less the entropy bonus along rollouts, which is interpolated; its errors are those on a front."""
+    """A vector critic less what its values hold beyond the return of rollouts, which is interpolated; its errors are those on
+    a front."""
 
     def predict(wanted: Array) -> Array:
-        bonus = predict_returns(wanted, rollouts.front.preferences, rollouts.entropy_bonus[:, None])[:, 0]
-        return critic_returns(model, rollouts.starts, wanted, bonus)
+        excess = predict_returns(wanted, rollouts.front.preferences, rollouts.excess)
+        return critic_values(model, rollouts.starts, wanted) - excess
 
-    errors = predict(front.preferences) - front.discounted_returns.mean(axis=1)
+    errors = predict(front.preferences) - front.discounted_values
     return Predictor(CRITIC, predict, front.preferences, errors)
 
 
 def predictors_of(model: MOMBA, rollouts: Rollouts, front: ParetoFront) -> list[Predictor]:
-    """Those that a model has, the one with the smallest error on its front first."""
+    """Those that a model has, the one with the smallest error on its front first; the front where no error is known."""
     found = [front_predictor(front)]
     if model.vector_values:
         found.append(critic_predictor(model, rollouts, front))
-    ranges = np.ptp(front.discounted_returns.mean(axis=1), axis=0)
-    return sorted(found, key=lambda predictor: predictor.size(ranges))
+    errors = sizes(found, np.ptp(front.discounted_values, axis=0))
+    return sorted(found, key=lambda predictor: errors[predictor.name])
 
 
 def share_close(predicted: Array, measured: Array) -> float:
@@ -105,7 +111,7 @@ def calibrate(
     n_objectives = predictors[0].preferences.shape[1]
     preferences = np.random.default_rng(seed).dirichlet(np.ones(n_objectives), size=n_preferences)
     preferences = preferences[preferences[:, 0].argsort()].astype(np.float32).astype(np.float64)
-    measured = roll_out(preferences).front.discounted_returns.mean(axis=1)
+    measured = roll_out(preferences).front.discounted_values
     return Calibration(preferences, measured, {one.name: one.predict(preferences) for one in predictors})
 
 

@@ -6,13 +6,14 @@ A filmed episode is one of `evaluate_front`, with the same numbers: cameras only
 import importlib.util
 import os
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -76,39 +77,42 @@ class Film:
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps what the first episode after the last reset looked like and earned, until another one ends.
+    """Keeps what the first episode that ends saw, did and earned, and what it looked like.
 
     :param picture: of the environment as it is now; None: nothing is drawn
     :param stride: steps between pictures
     """
 
-    def __init__(self, env: gym.Env, picture: Callable[[gym.Env], Any] | None, stride: int = 1):
+    def __init__(self, env: gym.Env, picture: Callable[[gym.Env], Any] | None = None, stride: int = 1):
         super().__init__(env)
         self.picture, self.stride = picture, stride
-        self.pictures: list[Any] = []
-        self.rewards: list[Any] = []
-        self.episode: tuple[list[Any], list[Any]] | None = None
+        self.is_over = self.is_truncated = False
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """The environment's."""
         observation, info = self.env.reset(**kwargs)
-        self.pictures, self.rewards = [], []
-        self._look()
+        if not self.is_over:
+            self.pictures: list[Any] = []
+            self.observations: list[NDArray[np.float32]] = []
+            self.actions: list[NDArray[np.float32]] = []
+            self.rewards: list[NDArray[np.float32]] = []
+            self._look(observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """The environment's."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.rewards.append(np.array(reward, dtype=np.float32))  # as PreferenceWrapper gives them
-        if len(self.rewards) % self.stride == 0:
-            self._look()
-        if (terminated or truncated) and self.episode is None:
-            self.episode = self.pictures, self.rewards
+        if not self.is_over:
+            self.actions.append(np.array(action, dtype=np.float32))
+            self.rewards.append(np.array(reward, dtype=np.float32))  # as PreferenceWrapper gives them
+            self._look(observation)
+            self.is_over, self.is_truncated = terminated or truncated, truncated and not terminated
         return observation, reward, terminated, truncated, info
 
-    def _look(self) -> None:
-        if self.picture is not None and self.episode is None:
+    def _look(self, observation: Any) -> None:
+        if self.picture is not None and len(self.rewards) % self.stride == 0:
             self.pictures.append(self.picture(self.env))
+        self.observations.append(np.array(observation, dtype=np.float32))
 
 
 def is_mujoco(env: gym.Env) -> bool:
@@ -138,11 +142,10 @@ def record_episode(
 
     jobs = [(number, preference, seed)]
     total, _, _ = run_jobs(model, recorded, None, jobs, 1.0, policy.deterministic)
-    assert recorders[0].episode is not None
-    pictures, rewards = recorders[0].episode
-    returns = np.cumsum(np.reshape(rewards, (len(rewards), -1)).astype(np.float64), axis=0)
+    rewards = np.array(recorders[0].rewards, dtype=np.float64)
+    returns = np.cumsum(rewards.reshape(len(rewards), -1), axis=0)
     assert np.array_equal(returns[-1], total[0])
-    return pictures, np.concatenate([np.zeros((1, returns.shape[1])), returns])
+    return recorders[0].pictures, np.concatenate([np.zeros((1, returns.shape[1])), returns])
 
 
 def film(policy: Policy, preference: NDArray[np.float64], number: int, seed: int, backend: str) -> Film:
@@ -242,8 +245,20 @@ def _load_version(path: Path, _written: int) -> MOMBA:
     return MOMBA.load(path, device="cpu")
 
 
+def end_with_parent() -> None:
+    """Let no one be left behind where this process is killed, or ended by a signal that it does not handle."""
+
+    def watch() -> None:
+        parent = parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 class RenderingProcess:
-    """A process in which OpenGL works; `with` ends it.
+    """A process in which OpenGL works; `with` ends it, and so does the end of this one.
 
     :param needs_gl: whether it must
     :raises RenderingError: where it does not, with what each way to draw said
@@ -256,7 +271,7 @@ class RenderingProcess:
             self._choose_backend()
 
     def _start(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent)
 
     def _choose_backend(self) -> None:
         reasons = []

@@ -56,6 +56,11 @@ class ParetoFront:
         return np.asarray(self.returns.mean(axis=1))
 
     @property
+    def discounted_values(self) -> Array:
+        """Mean discounted return of each preference, (P, n_objectives)."""
+        return np.asarray(self.discounted_returns.mean(axis=1))
+
+    @property
     def n_objectives(self) -> int:
         """Width of preferences and returns."""
         return int(self.preferences.shape[1])

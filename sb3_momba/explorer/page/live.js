@@ -17,6 +17,7 @@
   // Two decimals, as the sliders have them, or as many as a weight between needs.
   const decimals = (w) => (w.every((x) => Math.abs(100 * x - Math.round(100 * x)) < 1e-3) ? 2 : 3);
   const written = (w) => w.map((x) => x.toFixed(decimals(w))).join(" / ");
+  const rounded = (x, digits) => number(Number(x.toPrecision(digits)));
   const described = (w) => w.map((x, i) => `${x.toFixed(decimals(w))} ${objectives[i]}`).join(", ");
 
   async function ask(action, question) {
@@ -148,7 +149,7 @@
 
   function fillCell(id, value, error) {
     at(id).replaceChildren(number(value));
-    if (error !== null) at(id).append(" ", element("span", `± ${number(Number(error.toPrecision(2)))}`, { class: "error" }));
+    if (error !== null) at(id).append(" ", element("span", `± ${rounded(error, 2)}`, { class: "error" }));
   }
 
   function mark(trace, values) {
@@ -165,7 +166,8 @@
     answer.returns.forEach((value, i) => fillCell(`predicted-${i}`, value, answer.error[i]));
     mark(PREDICTED, answer.returns);
     document.body.dataset.predicted = milliseconds.toFixed(1);
-    said.predicted = `Predicted in ${milliseconds < 10 ? milliseconds.toFixed(1) : Math.round(milliseconds)} ms; ± is the error nearby.`;
+    const error = answer.error.includes(null) ? "" : "; ± is the error nearby";
+    said.predicted = `Predicted in ${rounded(milliseconds, 2)} ms${error}.`;
     say();
   }
 
@@ -181,12 +183,14 @@
       fillCell(`rollout-${i}`, value, answer.discounted_spread && answer.discounted_spread[i]);
       at(`rollout-${i}`).classList.remove("waiting");
     });
+    const cell = (id) => at(id).textContent;
+    at("spoken").textContent = objectives.map((name, i) => `${name}: predicted ${cell(`predicted-${i}`)}, rollout ${cell(`rollout-${i}`)}`).join("; ");
     mark(ROLLOUT, answer.discounted);
     const made = answer.alternatives.map((one) => {
       const item = element("li");
       const text = element("span");
       text.append(element("strong", written(one.preference)), ` returns ${one.returns.map(number).join(" / ")}; difference `,
-        `${number(Number(one.distance.toPrecision(2)))}, most in the ${one.differs}`);
+        `${rounded(one.distance, 2)}, most in the ${one.differs}`);
       const button = element("button", "Show", { type: "button", "aria-label": `Show ${described(one.preference)}` });
       button.addEventListener("click", () => {
         choose(one.preference);
@@ -226,30 +230,33 @@
   function rateSentences(rates) {
     const list = element("ul", undefined, { class: "plain" });
     for (const [given, gained] of [[0, 1], [1, 0]]) {
-      const rate = rates[given][gained];
+      const rate = rates[given][gained][gained];
       const item = element("li");
       const text = element("span", undefined, { class: "rate" });
       if (rate === null) text.append(`Less in ${objectives[given]} buys nothing in ${objectives[gained]} here.`);
-      else text.append(`1 less in ${objectives[given]} buys `, element("strong", number(Number(rate.toPrecision(3)))), ` in ${objectives[gained]}.`);
+      else text.append(`1 less in ${objectives[given]} buys `, element("strong", rounded(rate, 3)), ` in ${objectives[gained]}.`);
       item.append(text);
       list.append(item);
     }
     return list;
   }
 
+  // A row for each shift of weight that takes from one objective and gives to the other, with what it does to all of them.
   function rateTable(rates) {
+    const pairs = objectives.flatMap((_, i) => objectives.map((_, k) => [i, k])).filter(([i, k]) => rates[i][k][k] !== null);
+    if (pairs.length === 0) return element("p", "No small shift of weight takes from one objective and gives to another here.");
     const box = element("div", undefined, { class: "scroll", tabindex: "0", role: "region", "aria-label": "Exchange rates" });
     const table = element("table", undefined, { class: "small rate" });
     const head = element("tr");
-    head.append(element("th", "1 less in … buys", { scope: "col" }), ...objectives.map((name) => element("th", name, { scope: "col" })));
+    head.append(...["Weight", ...objectives].map((name) => element("th", name, { scope: "col" })));
     table.append(element("thead"), element("tbody"));
     table.tHead.append(head);
-    rates.forEach((line, i) => {
+    for (const [i, k] of pairs) {
       const row = element("tr");
-      row.append(element("th", objectives[i], { scope: "row" }));
-      line.forEach((rate, k) => row.append(element("td", i === k ? "" : rate === null ? "none" : number(Number(rate.toPrecision(3))))));
+      row.append(element("th", `from ${objectives[i]} to ${objectives[k]}`, { scope: "row" }));
+      for (const change of rates[i][k]) row.append(element("td", (change > 0 ? "+" : "") + rounded(change, 3)));
       table.tBodies[0].append(row);
-    });
+    }
     box.append(table);
     return box;
   }
@@ -286,10 +293,11 @@
     }
     choose(found.preference);
     const name = objectives[objective];
-    const returns = objectives.map((one, i) => `${one} ${number(found.discounted[i])}`).join(", ");
-    const of = found.n_episodes === 1 ? "its rollout" : `the mean of ${found.n_episodes} rollouts`;
+    const spread = (i) => (found.discounted_spread ? ` ± ${rounded(found.discounted_spread[i], 2)}` : "");
+    const returns = objectives.map((one, i) => `${one} ${number(found.discounted[i])}${spread(i)}`).join(", ");
+    const of = found.n_episodes === 1 ? "its episode" : `the mean of ${found.n_episodes} episodes`;
     const text = found.met
-      ? `${written(found.preference)} keeps it: ${returns} in ${of}, where at least ${number(found.at_least)} ${name} was asked for.`
+      ? `${written(found.preference)} kept it in ${of}: ${returns}, where at least ${number(found.at_least)} ${name} was asked for.`
       : `No policy that was found has ${number(found.at_least)} ${name}. The closest is ${written(found.preference)}: ${returns} in ${of}.`;
     const back = element("button", `Back to ${written(before)}`, { type: "button" });
     back.addEventListener("click", () => choose(before));
@@ -301,8 +309,7 @@
     const kept = await ask("/keep", { preference: mine });
     const said = element("p", `Kept ${written(mine)} in `, { class: "good" });
     said.append(element("code", kept.folder), `: ${kept.files.join(", ")}.`);
-    const weights = `[${mine.map((x) => Number(x.toFixed(6))).join(", ")}]`;
-    const code = `model = MOMBA.load("${kept.folder}/model.zip")\naction, _ = model.predict(obs, preference=${weights}, deterministic=True)`;
+    const code = `model = MOMBA.load("${kept.folder}/model.zip")\naction, _ = model.predict(obs, deterministic=True)`;
     return [said, ...kept.notes.map((note) => element("p", note, { class: "notice" })), element("pre", code)];
   }
 
