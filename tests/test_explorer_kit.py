@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -266,6 +267,9 @@ def test_a_model_alone_is_surveyed(vector_model, monkeypatch):
         for predictors in (kit.predictors, kit.predictors[::-1]):
             monkeypatch.setattr(kit, "predictors", predictors)
             assert kit.about_prediction().startswith(begins[predictors[0].name])
+        unknown = [replace(one, errors=np.full_like(one.errors, np.nan)) for one in kit.predictors if one.name == FRONT]
+        monkeypatch.setattr(kit, "predictors", unknown)
+        assert kit.about_prediction().endswith("How far that is off is not known: none of them lies between others.")
         assert kit.feature(0) == "mean of observation[0]"
         n = kit.model.policy.observation_dim
         assert kit.feature(n) == "mean of action[0]"

@@ -256,7 +256,7 @@ def test_three_objectives_without_opengl(browser, tmp_path, monkeypatch):
         assert text(page, "#rollout-0") != ""
         assert watched.overflowing() == []
         assert page.eval_on_selector_all("#rates tbody tr", "(rows) => rows.map((row) => row.innerText.split('\\t'))") == [
-            ["from forward speed to jumping height", "-1", "+2", "-0.5"]
+            ["1 less in forward speed, weight to jumping height", "-1", "+2", "-0.5"]
         ]
         assert watched.said == []
         watched.page.close()

@@ -150,29 +150,30 @@ def _front_traces(run: Run, i: int, values: Array, ranges: Array, texts: Sequenc
     """Those that no other one dominates, and the others, fainter."""
     on_front = non_dominated(values)
     traces = []
-    for chosen, opacity in ((~on_front, 0.35), (on_front, 1.0)):
-        order = np.flatnonzero(chosen)
+    for is_front in (False, True):
+        order = np.flatnonzero(on_front == is_front)
         if values.shape[1] == 2:
             order = order[values[order, 0].argsort()]  # The line runs along the front.
-        traces.append(_points(run, i, order, values, ranges, opacity, texts))
+        traces.append(_points(run, i, order, values, ranges, is_front, texts))
     return traces
 
 
 def _points(
-    run: Run, i: int, order: NDArray[np.int64], values: Array, ranges: Array, opacity: float, texts: Sequence[str] | None
+    run: Run, i: int, order: NDArray[np.int64], values: Array, ranges: Array, is_front: bool, texts: Sequence[str] | None
 ) -> Chart:
     n_objectives = values.shape[1]
     repeats = 1 if n_objectives in (2, 3) else n_objectives + 1
-    is_line = n_objectives != 3 and (n_objectives != 2 or opacity == 1.0)
+    is_line = n_objectives != 3 and (n_objectives != 2 or is_front)
+    size, size_on_front = {2: (6, 10), 3: (4, 5)}.get(n_objectives, (6, 6))
     trace: Chart = {
         "type": "scatter3d" if n_objectives == 3 else "scatter",
         "mode": "lines+markers" if is_line else "markers",
         "name": as_label(run.name),
         "legendgroup": str(i),
-        "showlegend": opacity == 1.0,
-        "opacity": opacity,
+        "showlegend": is_front,
+        "opacity": 1.0 if is_front else 0.35,
         "marker": {
-            "size": (5 if n_objectives == 3 else 10) if opacity == 1.0 and repeats == 1 else 4 if n_objectives == 3 else 6,
+            "size": size_on_front if is_front else size,
             "color": colour_of(i),
             "symbol": SYMBOLS[i % len(SYMBOLS)],
             "line": {"width": 0 if n_objectives == 3 else 1, "color": "white"},

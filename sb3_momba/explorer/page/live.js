@@ -107,8 +107,7 @@
     asking = true;
     const asked = preference;
     try {
-      const start = performance.now();
-      showPrediction(await ask("/predict", { preference }), performance.now() - start);
+      showPrediction(await ask("/predict", { preference }));
     } catch (error) {
       complain(error);
     }
@@ -162,12 +161,11 @@
     at("film-returns").classList.add("stale");
   }
 
-  function showPrediction(answer, milliseconds) {
+  function showPrediction(answer) {
     answer.returns.forEach((value, i) => fillCell(`predicted-${i}`, value, answer.error[i]));
     mark(PREDICTED, answer.returns);
-    document.body.dataset.predicted = milliseconds.toFixed(1);
     const error = answer.error.includes(null) ? "" : "; ± is the error nearby";
-    said.predicted = `Predicted in ${rounded(milliseconds, 2)} ms${error}.`;
+    said.predicted = `Predicted in ${rounded(1000 * answer.seconds, 2)} ms${error}.`;
     say();
   }
 
@@ -248,12 +246,12 @@
     const box = element("div", undefined, { class: "scroll", tabindex: "0", role: "region", "aria-label": "Exchange rates" });
     const table = element("table", undefined, { class: "small rate" });
     const head = element("tr");
-    head.append(...["Weight", ...objectives].map((name) => element("th", name, { scope: "col" })));
+    head.append(...["What it changes", ...objectives].map((name) => element("th", name, { scope: "col" })));
     table.append(element("thead"), element("tbody"));
     table.tHead.append(head);
     for (const [i, k] of pairs) {
       const row = element("tr");
-      row.append(element("th", `from ${objectives[i]} to ${objectives[k]}`, { scope: "row" }));
+      row.append(element("th", `1 less in ${objectives[i]}, weight to ${objectives[k]}`, { scope: "row" }));
       for (const change of rates[i][k]) row.append(element("td", (change > 0 ? "+" : "") + rounded(change, 3)));
       table.tBodies[0].append(row);
     }
