@@ -23,6 +23,14 @@ class HeldNoise:
             self.noise, self.steps_left = th.zeros_like(like), th.zeros(len(like), dtype=th.int64)
         ended = self.steps_left == 0
         drawn = th.multinomial(self.probabilities, len(like), replacement=True) + 1
-        self.noise = th.where(ended[:, None].to(like.device), th.randn_like(like), self.noise)
+        self.noise = th.where(ended[:, None].to(like.device), th.randn_like(like), self.noise.to(like.device))
         self.steps_left = th.where(ended, drawn, self.steps_left) - 1
         return self.noise
+
+    def state_dict(self) -> dict[str, th.Tensor | None]:
+        """What the next steps depend on."""
+        return {"noise": self.noise, "steps_left": self.steps_left}
+
+    def load_state_dict(self, state: dict[str, th.Tensor | None]) -> None:
+        """:param state: of `state_dict`"""
+        vars(self).update(state)

@@ -23,7 +23,7 @@ from torch import nn
 
 from sb3_momba.envs.preferences import check_preference
 from sb3_momba.files import atomic_write
-from sb3_momba.policies import MombaPolicy
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.system import library_versions
 
 OPSET = 17  # of ONNX; its runtimes have it since 2022

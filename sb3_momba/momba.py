@@ -4,35 +4,29 @@ import contextlib
 import logging
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 
-from sb3_momba.acting import PreferenceConditionedAlgorithm
+from sb3_momba.algorithm import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
-from sb3_momba.diagnostics import Metrics, NegativeReturnWatch, TrainingMetrics, weight_norm
+from sb3_momba.diagnostics import Metrics
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
 from sb3_momba.envs.wrappers import n_objectives_of
-from sb3_momba.exploration import HeldNoise
 from sb3_momba.nn.batch_norm import follow_batch_statistics, without_batch_statistics
 from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest
 from sb3_momba.nn.layers import in_float32
-from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.products import fast_float32_products, product_dtype
-from sb3_momba.nn.speed import keep_freed_memory, without_weight_gradients
-from sb3_momba.policies import FlashSacPolicy, MlpPolicy, MombaPolicy, SimbaPolicy, XqcPolicy
+from sb3_momba.nn.speed import without_weight_gradients
+from sb3_momba.policies import SHIPPED_POLICIES
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.settings import (
-    HER_DEFAULTS,
     check_other_arguments,
-    check_settings,
     parameters,
-    parse_ent_coef,
-    parse_target_entropy,
 )
 
 MAX_SKIPPED_UPDATES = 20
@@ -93,13 +87,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :raises TypeError: for an argument that there is not, naming the nearest
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        policy.__name__: policy for policy in (SimbaPolicy, MlpPolicy, XqcPolicy, FlashSacPolicy)
-    }
-    policy: MombaPolicy
-    actor: Actor  # type: ignore[assignment]
-    critic: Critic
-    critic_target: Critic
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {policy.__name__: policy for policy in SHIPPED_POLICIES}
 
     def __init__(
         self,
@@ -198,84 +186,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
-    # ------------------------------------------------------------------------------------------------ construction
-
-    def _setup_model(self) -> None:
-        self._check_settings()
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
-        if self.env is not None:
-            self._prepare_env(self.env)
-        self.replay_buffer = self._make_replay_buffer()
-        self.policy = self.policy_class(  # type: ignore[assignment]
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            **self._injected_policy_kwargs(),
-            **self.policy_kwargs,
-        ).to(self.device)
-        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        keep_freed_memory()
-        for network in (self.actor, self.critic, self.critic_target):
-            network.compiled = self.compile
-        self._setup_entropy_coefficient()
-        self._held_noise = HeldNoise(self.noise_repeat)
-        self._metrics = TrainingMetrics()
-        self._negative_returns = NegativeReturnWatch()
-        self._skipped_updates = 0
-
-    def _check_settings(self) -> None:
-        """:raises ValueError: for options that do not go together, saying why"""
-        self._convert_train_freq()
-        assert isinstance(self.train_freq, TrainFreq)
-        if self.train_freq.unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
-            raise ValueError(
-                f"train_freq={self.train_freq.frequency} episodes with n_envs={self.n_envs}: episodes end at different times; "
-                "count steps, or use one environment."
-            )
-        check_settings(self)
-
-    def _injected_policy_kwargs(self) -> dict[str, Any]:
-        """What the policy must know of the algorithm; the user's `policy_kwargs` stay as they were given."""
-        return {
-            "n_objectives": self.n_objectives,
-            "critic_loss": self.critic_loss,
-            "vector_values": self.vector_values,
-            "best_return_scale": self.best_return_scale,
-            "return_scaling": self.return_scaling,
-            "gamma": self.gamma,
-        }
-
-    def _make_replay_buffer(self) -> PreferenceReplayBuffer:
-        relabelling = {**HER_DEFAULTS, **(self.her_kwargs or {})} if self.her else {}
-        buffer_class: Any = self.replay_buffer_class or PreferenceReplayBuffer
-        return buffer_class(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            n_envs=self.n_envs,
-            optimize_memory_usage=self.optimize_memory_usage,
-            **{
-                "n_objectives": self.n_objectives,
-                "gamma": self.gamma,
-                "n_steps": self.n_steps,
-                "seed": self.seed,
-                **relabelling,
-                **self.replay_buffer_kwargs,
-            },
-        )
-
-    def _setup_entropy_coefficient(self) -> None:
-        """alpha = exp(beta), learned or fixed (section 3.4.2)."""
-        self.target_entropy = parse_target_entropy(self.target_entropy, int(np.prod(self.action_space.shape)))  # type: ignore[arg-type]
-        learned, start = parse_ent_coef(self.ent_coef)
-        if learned:
-            self.log_ent_coef = th.tensor(start, device=self.device).log().requires_grad_(True)
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
-        else:
-            self.ent_coef_tensor = th.tensor(start, device=self.device)
-
     # -------------------------------------------------------------------------------------------------- learning
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
@@ -293,13 +203,20 @@ class MOMBA(PreferenceConditionedAlgorithm):
         if self.ent_coef_optimizer is not None and self.ent_coef_learning_rate is not None:
             update_learning_rate(self.ent_coef_optimizer, self.ent_coef_learning_rate)
 
-        with fast_float32_products():
-            for _ in range(gradient_steps):
-                try:
-                    self._gradient_step(self._sample(batch_size))
-                    self._skipped_updates = 0
-                except NonFiniteLossError as error:
-                    self._skip_update(error)
+        try:
+            with fast_float32_products():
+                for _ in range(gradient_steps):
+                    self._try_gradient_step(self._sample(batch_size))
+        finally:
+            self.policy.set_training_mode(False)
+
+    def _try_gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
+        """One gradient step, skipped if a loss is not finite."""
+        try:
+            self._gradient_step(batch)
+            self._skipped_updates = 0
+        except NonFiniteLossError as error:
+            self._skip_update(error)
 
     def _gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
         """One pass through the inner loop of Algorithm 1."""
@@ -308,7 +225,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
             critic_loss, metrics = self._critic_loss(batch, alpha)
         descend(self.critic.optimizer, critic_loss, "critic")
         follow_batch_statistics(self.critic)
-        follow_batch_statistics(self.critic_target)
         try:
             if self._n_updates % self.policy_delay == 0:
                 metrics |= self._improve_policy(batch, alpha)
@@ -320,9 +236,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def _improve_policy(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> Metrics:
         """The steps of the actor and the entropy coefficient."""
-        # Of batch norm, only the network that takes the step sees the batch: the critics judge a new action as they would
-        # alone, and their running averages stay those of the actions in the buffer.
-        with self._rounded_products(), without_weight_gradients(self.critic), without_batch_statistics(self.critic):
+        with self._rounded_products(), without_weight_gradients(self.critic):
             actor_loss, log_prob, metrics = self._actor_loss(batch, alpha)
         descend(self.actor.optimizer, actor_loss, "actor")
         follow_batch_statistics(self.actor)
@@ -387,7 +301,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
     def _actor_loss(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> tuple[th.Tensor, th.Tensor, Metrics]:
         """Eq. (3.18), with eq. (3.21)'s alignment if it is on. Also returns log pi(a | s, w), (batch,)."""
         actions, log_prob = self.actor.action_log_prob(batch.observations)
-        q_vector = self.policy.value.mean(self.critic(batch.observations, actions))
+        # Of batch norm, only the network that takes the step sees the batch: critics judge a new action as they would alone.
+        with without_batch_statistics(self.critic):
+            q_vector = self.policy.value.mean(self.critic(batch.observations, actions))
         if self.critic_minimum == "objective":
             q_vector = q_vector.amin(dim=1, keepdim=True)
         q = self._scalarised(q_vector, batch.preferences)
@@ -410,16 +326,6 @@ class MOMBA(PreferenceConditionedAlgorithm):
     def _scalarised(self, values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
         """w.Q of eqs. (3.12) and (3.16): (batch, n_critics, n_values) -> (batch, n_critics)."""
         return scalarise(values, preferences[:, None]) if self.vector_values else values.squeeze(-1)
-
-    def dump_logs(self) -> None:
-        """Write the log, with the means of the training metrics since the last time."""
-        if self._metrics.sums:
-            self._metrics.record(self.logger)
-            self.logger.record("train/return_scale", self.policy.return_scale.factor)
-            self.logger.record("train/actor_weight_norm", weight_norm(self.actor))
-            self.logger.record("train/critic_weight_norm", weight_norm(self.critic))
-            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        super().dump_logs()
 
 
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:

@@ -26,7 +26,7 @@ from sb3_momba.files import (
     write_tree,
 )
 from sb3_momba.formats import header, read_format
-from sb3_momba.policies import MombaPolicy
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.settings import nearest
 
 MODEL_FORMAT = "sb3_momba.model"

@@ -14,7 +14,8 @@ from torch import nn
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.nn.products import PRECISIONS
 from sb3_momba.nn.speed import has_compiler
-from sb3_momba.policies import FlashSacPolicy, MlpPolicy, MombaPolicy, SimbaPolicy, XqcPolicy
+from sb3_momba.policies import SHIPPED_POLICIES, MlpPolicy
+from sb3_momba.policy import MombaPolicy
 
 SWITCHES = ("vector_values", "her", "preference_alignment", "compile", "deterministic_exploration", "optimize_memory_usage")
 # The least that they may be.
@@ -111,6 +112,15 @@ def check_settings(model: Any) -> None:
 def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
     if model.preference_alignment and not model.vector_values:
         raise ValueError("preference_alignment=True needs the vector Q of eq. (3.21): set vector_values=True.")
+    if model.noise_repeat > 1 and model.deterministic_exploration:
+        raise ValueError(
+            f"noise_repeat={model.noise_repeat} with deterministic_exploration=True: the mean action has no noise."
+        )
+    if model.ent_coef_learning_rate is not None and not parse_ent_coef(model.ent_coef)[0]:
+        raise ValueError(
+            f"ent_coef_learning_rate={model.ent_coef_learning_rate} with ent_coef={model.ent_coef!r}, which is fixed: leave "
+            'one of them out, or learn it by "auto_0.2".'
+        )
     if model.critic_minimum == "objective" and not model.vector_values:
         raise ValueError("critic_minimum='objective' needs a Q for each objective: set vector_values=True.")
     if model.n_objectives == 1 and (model.her or model.preference_alignment):
@@ -122,10 +132,6 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
         for name, value in model.her_kwargs.items():
             if not is_number(value):
                 raise ValueError(f"her_kwargs={{{name!r}: {value!r}}}: give a number.")
-        relabels = model.her_kwargs.get("n_relabels", 1)
-        check_whole("her_kwargs n_relabels", relabels, 1)
-        if model.batch_size % relabels != 0:
-            raise ValueError(f"her_kwargs n_relabels={relabels} does not divide batch_size={model.batch_size}.")
     if model.compile and not has_compiler():
         raise ValueError(
             "compile=True needs a C++ compiler, and there is none (g++, clang++, or CXX): install one, or leave it out."
@@ -138,6 +144,18 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
         )
     if buffer_class is PreferenceReplayBuffer:
         check_names("replay_buffer_kwargs", settings["replay_buffer_kwargs"], BUFFER_ARGUMENTS)
+        relabelling = {**(HER_DEFAULTS if model.her else {}), **(model.her_kwargs or {}), **settings["replay_buffer_kwargs"]}
+        _check_relabels(relabelling, model.batch_size)
+
+
+def _check_relabels(relabelling: Mapping[str, Any], batch_size: int) -> None:
+    """:param relabelling: what the buffer is given"""
+    n = relabelling.get("n_relabels", 1)
+    check_whole("n_relabels", n, 1)
+    if batch_size % n != 0:
+        raise ValueError(f"n_relabels={n} does not divide batch_size={batch_size}.")
+    if n > 1 and relabelling.get("keep_probability", 1) == 1:
+        raise ValueError(f"n_relabels={n}, where no preference is relabelled: set her=True, and keep_probability below 1.")
 
 
 def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
@@ -147,7 +165,7 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
     doubled = sorted(set(policy_kwargs) & set(INJECTED))
     if doubled:
         raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
-    if policy in (SimbaPolicy, MlpPolicy, XqcPolicy, FlashSacPolicy):
+    if policy in SHIPPED_POLICIES:
         for name in policy_kwargs:
             if name in OF_SACS_POLICY:
                 raise ValueError(f"policy_kwargs {name}={policy_kwargs[name]!r}: {OF_SACS_POLICY[name]}.")

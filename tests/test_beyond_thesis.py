@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_momba import MOMBA
+from sb3_momba import MOMBA, MombaCheckpointCallback
 from sb3_momba.exploration import HeldNoise
 from sb3_momba.nn.normalization import DeviationScale
 from sb3_momba.settings import parse_target_entropy
@@ -120,6 +121,40 @@ def test_actions_are_the_mean_and_the_deviation_under_the_held_noise():
     assert model._held_noise.steps_left.min() >= 0
 
 
+def test_action_noise_is_added_to_held_noise():
+    shifted = NormalActionNoise(np.full(2, 0.25), np.zeros(2))
+    model = tiny_model(StubEnv(), noise_repeat=4, learning_starts=5, action_noise=shifted).learn(20)
+    with th.no_grad():
+        mean, log_std = model.actor.distribution(model.policy.normalize(th.as_tensor(model._last_obs)))
+    _, scaled = model._sample_action(0, shifted)
+    sampled = th.tanh(mean + log_std.exp() * model._held_noise.noise).numpy()
+    np.testing.assert_allclose(scaled, np.clip(sampled + 0.25, -1, 1), rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:Environments .* could not be brought back")
+def test_going_on_may_hold_noise_for_another_time(tmp_path):
+    tiny_model(StubEnv(), noise_repeat=8, learning_starts=5).learn(30, MombaCheckpointCallback(30, tmp_path))
+    again = MOMBA.resume(tmp_path, StubEnv(), noise_repeat=2)
+    assert len(again._held_noise.probabilities) == again.noise_repeat == 2
+    assert again._held_noise.noise is not None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"noise_repeat": 2, "deterministic_exploration": True}, "noise_repeat=2 with deterministic_exploration"),
+        ({"ent_coef": 0.1, "ent_coef_learning_rate": 1e-3}, "ent_coef_learning_rate=0.001 with ent_coef=0.1, which is fixed"),
+        ({"replay_buffer_kwargs": {"n_relabels": 2}}, "n_relabels=2, where no preference is relabelled"),
+        ({"her": True, "her_kwargs": {"n_relabels": 2, "keep_probability": 1.0}}, "n_relabels=2, where no"),
+        ({"her": True, "replay_buffer_kwargs": {"n_relabels": 3}, "batch_size": 8}, "does not divide batch_size=8"),
+    ],
+    ids=["noise of the mean", "rate of a fixed alpha", "relabels without HER", "relabels that all keep", "rows"],
+)
+def test_what_would_be_ignored_is_refused(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        tiny_model(StubEnv(), **arguments)
+
+
 def test_the_first_actions_stay_uniform():
     model = tiny_model(StubEnv(), noise_repeat=8, learning_starts=30).learn(20)
     assert model._held_noise.noise is None
@@ -162,6 +197,16 @@ def test_rewards_are_divided_by_the_largest_deviation_or_by_what_keeps_the_maxim
     for reward in ([4.0, 1.0], [0.0, 1.0], [0.0, 1.0]):
         tight.update(np.array([reward]), np.array([False]))
     assert tight.factor == pytest.approx(2 / 4)
+    two_environments = DeviationScale(5.0, 0.5, 1)
+    two_environments.update(np.array([[1.0], [3.0]]), np.array([False, False]))
+    assert two_environments.factor == pytest.approx(1 / 1)
+
+
+def test_returns_that_are_all_equal_have_no_deviation_to_divide_by():
+    scale = DeviationScale(5.0, 0.0, 1)
+    for _ in range(3):
+        scale.update(np.array([[2.0], [2.0]]), np.array([False, False]))
+    assert scale.factor == pytest.approx(5 / 2)
 
 
 def test_the_deviation_scales_a_training_and_is_saved(tmp_path):
@@ -178,13 +223,6 @@ def test_the_deviation_scales_a_training_and_is_saved(tmp_path):
 
 
 # -------------------------------------------------------------------------------------------------------- all of it
-
-NEUTRAL = {"policy_delay": 1, "noise_repeat": 1, "ent_coef_learning_rate": None, "target_entropy": "auto"}
-
-
-def test_neutral_values_are_the_default():
-    default, neutral = tiny_model(StubEnv()).learn(60), tiny_model(StubEnv(), **NEUTRAL).learn(60)
-    assert same(parameters_of(default.policy), parameters_of(neutral.policy))
 
 
 @pytest.mark.parametrize("name", ["policy_delay", "noise_repeat"])

@@ -44,6 +44,7 @@ def everything(model: MOMBA) -> dict:
         "observations": model._last_obs,
         "steps": [model.num_timesteps, model._n_updates, model._episode_num],
         "running_returns": model.policy.return_scale.running_returns,
+        "held_noise": model._held_noise.state_dict(),
         "random": [th.get_rng_state(), model.replay_buffer.rng.bit_generator.state],
     }
 
@@ -73,7 +74,9 @@ VARIANTS = {
     "noise that remembers, three environments": {
         **{"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5)), "n_envs": 3},
     },
-    "held noise, a delayed actor": {"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15"},
+    "held noise, a delayed actor, three environments": {
+        **{"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15", "return_scaling": "deviation", "n_envs": 3},
+    },
     "XqcPolicy, vector": {"policy": "XqcPolicy", "vector_values": True},
     "FlashSacPolicy, HER": {"policy": "FlashSacPolicy", "her": True},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},

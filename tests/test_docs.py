@@ -27,7 +27,8 @@ import sb3_momba
 from sb3_momba import MOMBA, train
 from sb3_momba.benchmark import grid
 from sb3_momba.envs.pgmorl import TASKS
-from sb3_momba.policies import MlpPolicy, MombaPolicy, SimbaPolicy
+from sb3_momba.policies import MlpPolicy, SimbaPolicy
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.settings import policy_parameters
 from tests.pages import (
     BLOCK,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sb3_momba
-from sb3_momba.policies import MombaPolicy
+from sb3_momba.policy import MombaPolicy
 
 PACKAGE = Path(sb3_momba.__file__).parent
 PUBLIC = {name: getattr(sb3_momba, name) for name in sb3_momba.__all__}

@@ -69,7 +69,7 @@ def test_row_01_a_scalar_reward_without_reward_space_trains_as_one_objective_and
     with caplog.at_level(logging.INFO, logger="sb3_momba"):
         model = tiny_model("Pendulum-v1", learning_starts=5).learn(20)
     assert [record.message for record in caplog.records if "one objective" in record.message] == [
-        "The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC."
+        "The environment has one objective: MOMBA trains it as single-objective SAC, with SimbaPolicy."
     ]
     assert model.n_objectives == 1
     assert model.observation_space.shape == (3,)

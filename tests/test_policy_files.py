@@ -9,7 +9,7 @@ import torch as th
 
 from sb3_momba import MOMBA, MlpPolicy, SimbaPolicy
 from sb3_momba.files import FileFormatError
-from sb3_momba.policies import MombaPolicy
+from sb3_momba.policy import MombaPolicy
 from tests.stubs import StubEnv, assert_same_tree, tiny_model
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)

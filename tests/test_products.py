@@ -88,7 +88,10 @@ def gradients(model: MOMBA, precision: str) -> list[th.Tensor]:
     return found
 
 
-@pytest.mark.parametrize(("policy", "critic_loss", "vector"), [("SimbaPolicy", "ce", False), ("MlpPolicy", "mse", True)])
+@pytest.mark.parametrize(
+    ("policy", "critic_loss", "vector"),
+    [("SimbaPolicy", "ce", False), ("MlpPolicy", "mse", True), ("XqcPolicy", "ce", True), ("FlashSacPolicy", "ce", False)],
+)
 def test_gradients_of_rounded_products_point_the_same_way(policy, critic_loss, vector):
     model = MOMBA(policy, StubEnv(), seed=0, buffer_size=200, critic_loss=critic_loss, vector_values=vector, device="cpu")
     model.learn(150)

@@ -293,7 +293,7 @@ def input_norm(network: nn.Module) -> BatchNorm:
 
 @every_policy
 def test_what_an_update_moves_the_running_averages_towards(policy: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The actor's: s. Those of critics and target critics: (s, a) and (s', a') together, whatever the actor's loss asks."""
+    """The actor's: s. The critics': (s, a) and (s', a') together, whatever the actor's loss asks. The target's stay."""
     model, batch = updated_once(policy)
     asked = []
     act = model.actor.action_log_prob
@@ -301,12 +301,11 @@ def test_what_an_update_moves_the_running_averages_towards(policy: str, monkeypa
     model.train(1, 16)
     next_actions = asked[0][0]
     seen = th.cat([th.cat([batch.observations, batch.actions], 1), th.cat([batch.next_observations, next_actions], 1)])
-    for network in (model.critic, model.critic_target):
-        norm = input_norm(network)
-        for member in range(2):
-            th.testing.assert_close(norm.running_mean[member, 0], MOMENTUM * seen.mean(0))
-            expected = 1 - MOMENTUM + MOMENTUM * seen.var(0, correction=0)
-            th.testing.assert_close(norm.running_variance[member, 0], expected)
+    for member in range(2):
+        th.testing.assert_close(input_norm(model.critic).running_mean[member, 0], MOMENTUM * seen.mean(0))
+        expected = 1 - MOMENTUM + MOMENTUM * seen.var(0, correction=0)
+        th.testing.assert_close(input_norm(model.critic).running_variance[member, 0], expected)
+    assert (input_norm(model.critic_target).running_mean == 0).all()
     th.testing.assert_close(input_norm(model.actor).running_mean, MOMENTUM * batch.observations.mean(0))
 
 
@@ -327,6 +326,27 @@ def test_only_networks_that_learn_see_the_batch(policy: str, monkeypatch: pytest
     ]
     model.predict(StubEnv().observation_space.sample(), preference=[0.5, 0.5])
     assert passes[-1] == ("actor", False, 1)
+
+
+@every_policy
+def test_a_skipped_step_of_the_actor_leaves_its_running_averages(policy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, _ = updated_once(policy)
+    before = {name: tensor.clone() for name, tensor in model.actor.state_dict().items()}
+    monkeypatch.setattr(model, "_actor_loss", lambda *_: (model.actor(th.zeros(4, 5)).sum() * th.nan, None, {}))
+    model.train(1, 16)
+    assert model._skipped_updates == 1
+    for name, tensor in model.actor.state_dict().items():
+        th.testing.assert_close(tensor, before[name], rtol=0, atol=1e-6)
+
+
+@every_policy
+def test_networks_rest_in_evaluation(policy: str, tmp_path: Path) -> None:
+    """Else an action would depend on the other rows of its batch."""
+    model = trained(policy)
+    model.policy.save(tmp_path / "policy")
+    loaded = type(model.policy).load(tmp_path / "policy")
+    for rested in (model.policy, loaded, tiny_model(StubEnv(), policy).policy):
+        assert not any(module.training for module in rested.modules())
 
 
 @every_policy
@@ -380,15 +400,6 @@ def test_running_averages_are_saved_and_all_is_float(policy: str, tmp_path: Path
     model.export(tmp_path / "policy.pt")  # which compares its actions with the policy's
 
 
-@every_policy
-def test_bfloat16_learns_alike_and_keeps_float32(policy: str) -> None:
-    model = trained(policy, precision="bfloat16", vector_values=True)
-    assert {tensor.dtype for tensor in [*model.actor.state_dict().values(), *model.critic.state_dict().values()]} == {
-        th.float32
-    }
-    assert all(tensor.isfinite().all() for tensor in model.policy.state_dict().values())
-
-
 def filled(policy: str, **kwargs: Any) -> MOMBA:
     model = tiny_model(StubEnv(), policy, learning_starts=60, **kwargs).learn(60)
     model.replay_buffer.seed(1)
@@ -423,7 +434,6 @@ def test_their_arguments_stand_on_the_page(policy: str, page: str) -> None:
     assert names == [
         *(f"{who}_{what}" for who in ("actor", "critic") for what in ("hidden_dim", "blocks")),
         "conditioning",
-        "normalize_weights",
     ]
     defaults = [inspect.signature(POLICIES[policy]).parameters[name].default for name in names[:4]]
     row = re.search(rf"^\| {policy} \| (.+)", page, re.MULTILINE)

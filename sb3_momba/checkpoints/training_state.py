@@ -52,7 +52,7 @@ def statistics_of(model: Any) -> dict[str, Any]:
         "metrics": vars(model._metrics),
         "negative_returns": vars(model._negative_returns),
         "skipped_updates": model._skipped_updates,
-        "held_noise": vars(model._held_noise),
+        "held_noise": model._held_noise.state_dict(),
     }
 
 
@@ -65,7 +65,7 @@ def set_statistics(model: Any, statistics: dict[str, Any]) -> None:
     if "count" in metrics:  # of earlier checkpoints: one for all
         metrics["counts"] = dict.fromkeys(metrics["sums"], metrics.pop("count"))
     vars(model._metrics).update(metrics)
-    vars(model._held_noise).update(statistics.get("held_noise", {}))
+    model._held_noise.load_state_dict(statistics.get("held_noise", {}))
     vars(model._negative_returns).update(statistics["negative_returns"])
     model._skipped_updates = statistics["skipped_updates"]
 

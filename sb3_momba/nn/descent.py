@@ -9,8 +9,7 @@ import torch as th
 def move_towards(target: th.nn.Module, network: th.nn.Module, tau: float) -> None:
     """target <- (1 - tau) target + tau network, all parameters in one call (Algorithm 1).
 
-    Running averages of batch norm stay the target's own: they describe its activations, not the network's. XQC and FlashSAC
-    do likewise.
+    Running averages of batch norm are left alone: the target is asked in training mode only, and never reads its own.
     """
     th._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
 

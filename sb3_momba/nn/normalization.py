@@ -126,4 +126,5 @@ class DeviationScale(ReturnScale):
         """What a reward is multiplied by; 1 while no return is above 1e-8."""
         if float(self.max_return) < SMALLEST_RETURN:
             return 1.0
-        return min(super().factor, 1 / float(self.statistics.variance.max().sqrt()))
+        assert self.best_return_scale is not None
+        return 1 / max(float(self.max_return) / self.best_return_scale, float(self.statistics.variance.max().sqrt()))

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_momba.envs.registry import PREFIX, raw_id
 from sb3_momba.momba import MOMBA
-from sb3_momba.policies import MombaPolicy
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.records import plain
 from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parameters, policy_parameters
 
@@ -132,9 +132,9 @@ def with_schedules(hyperparameters: dict[str, Any]) -> dict[str, Any]:
     rate = hyperparameters.get("learning_rate")
     if not isinstance(rate, str):
         return hyperparameters
-    first, _, last = rate.removeprefix(LINEAR).partition("_")
-    start, end = number_in(first), number_in(last or "0")
-    if not rate.startswith(LINEAR) or start is None or end is None:
+    ends = [number_in(part) for part in rate.removeprefix(LINEAR).split("_")]
+    start, end = ends if len(ends) == 2 else (*ends, 0.0)[:2]
+    if not rate.startswith(LINEAR) or len(ends) > 2 or start is None or end is None or start < end:
         raise ValueError(
             f"learning_rate={rate!r}: give a number of at least 0, or {LINEAR}3e-4 to fall from it to 0, {LINEAR}3e-4_1e-4 to "
             "fall to 1e-4."

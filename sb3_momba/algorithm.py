@@ -1,4 +1,4 @@
-"""What makes an off-policy algorithm act on preferences: environments, prediction, exploration, episodes, going on."""
+"""What stands around Algorithm 1: construction, environments, prediction, exploration, episodes, logs, going on."""
 
 import logging
 import os
@@ -8,19 +8,20 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.checkpoints.checkpoint import resume
 from sb3_momba.checkpoints.folders import Checkpoint
 from sb3_momba.checkpoints.training_state import callbacks_below, given_callback, set_states_of_callbacks
-from sb3_momba.diagnostics import NegativeReturnWatch
+from sb3_momba.diagnostics import NegativeReturnWatch, TrainingMetrics, weight_norm
 from sb3_momba.envs.preferences import (
     FixedSampler,
     PreferenceSampler,
@@ -34,8 +35,11 @@ from sb3_momba.exploration import HeldNoise
 from sb3_momba.export import export_policy
 from sb3_momba.finite import all_finite
 from sb3_momba.logs import forgive_full_disks
-from sb3_momba.policies import MombaPolicy
+from sb3_momba.nn.networks import Actor, Critic
+from sb3_momba.nn.speed import keep_freed_memory
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
+from sb3_momba.settings import HER_DEFAULTS, check_settings, parse_ent_coef, parse_target_entropy
 
 Self = TypeVar("Self", bound="PreferenceConditionedAlgorithm")
 
@@ -43,18 +47,104 @@ logger = logging.getLogger(__name__)
 
 
 class PreferenceConditionedAlgorithm(PickleFreeSaving):
-    """An off-policy algorithm whose policy reads [observation, preference]."""
+    """An off-policy algorithm whose policy reads [observation, preference]; a subclass has the arguments and the update."""
 
     policy: MombaPolicy
+    actor: Actor
+    critic: Critic
+    critic_target: Critic
+    critic_loss: str
+    vector_values: bool
+    her: bool
+    her_kwargs: dict[str, Any] | None
+    preference_alignment: bool
     preference_sampler: PreferenceSampler | SamplerSpec | None
+    best_return_scale: float | None
+    return_scaling: str
+    target_entropy: str | float
     deterministic_exploration: bool
     noise_repeat: int
-    _held_noise: HeldNoise
-    _negative_returns: NegativeReturnWatch
-    preference_alignment: bool
+    compile: bool
+    log_ent_coef: th.Tensor | None
     _root_callback: BaseCallback | None = None
     _states_of_callbacks: dict[str, Any] | None = None  # from a checkpoint, for the callbacks of the next `learn`
     _resumed_from: tuple[Checkpoint, PreferenceReplayBuffer] | None = None  # and the buffer that it filled
+
+    def _setup_model(self) -> None:
+        self._check_settings()
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        if self.env is not None:
+            self._prepare_env(self.env)
+        self.replay_buffer = self._make_replay_buffer()
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            **self._injected_policy_kwargs(),
+            **self.policy_kwargs,
+        ).to(self.device)
+        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
+        keep_freed_memory()
+        for network in (self.actor, self.critic, self.critic_target):
+            network.compiled = self.compile
+        self._setup_entropy_coefficient()
+        self._held_noise = HeldNoise(self.noise_repeat)
+        self._metrics = TrainingMetrics()
+        self._negative_returns = NegativeReturnWatch()
+        self._skipped_updates = 0
+
+    def _check_settings(self) -> None:
+        """:raises ValueError: for options that do not go together, saying why"""
+        self._convert_train_freq()
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
+            raise ValueError(
+                f"train_freq={self.train_freq.frequency} episodes with n_envs={self.n_envs}: episodes end at different times; "
+                "count steps, or use one environment."
+            )
+        check_settings(self)
+
+    def _injected_policy_kwargs(self) -> dict[str, Any]:
+        """What the policy must know of the algorithm; the user's `policy_kwargs` stay as they were given."""
+        return {
+            "n_objectives": self.n_objectives,
+            "critic_loss": self.critic_loss,
+            "vector_values": self.vector_values,
+            "best_return_scale": self.best_return_scale,
+            "return_scaling": self.return_scaling,
+            "gamma": self.gamma,
+        }
+
+    def _make_replay_buffer(self) -> PreferenceReplayBuffer:
+        relabelling = {**HER_DEFAULTS, **(self.her_kwargs or {})} if self.her else {}
+        buffer_class: Any = self.replay_buffer_class or PreferenceReplayBuffer
+        return buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **{
+                "n_objectives": self.n_objectives,
+                "gamma": self.gamma,
+                "n_steps": self.n_steps,
+                "seed": self.seed,
+                **relabelling,
+                **self.replay_buffer_kwargs,
+            },
+        )
+
+    def _setup_entropy_coefficient(self) -> None:
+        """alpha = exp(beta), learned or fixed (section 3.4.2)."""
+        self.target_entropy = parse_target_entropy(self.target_entropy, int(np.prod(self.action_space.shape)))  # type: ignore[arg-type]
+        learned, start = parse_ent_coef(self.ent_coef)
+        if learned:
+            self.log_ent_coef = th.tensor(start, device=self.device).log().requires_grad_(True)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
+        else:
+            self.ent_coef_tensor = th.tensor(start, device=self.device)
 
     @staticmethod
     def _wrap_env(env: GymEnv | str | Callable[[], gym.Env], verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -93,7 +183,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             sampler = make_sampler(self.preference_sampler, self.n_objectives)
             env.env_method("set_preference_sampler", CloudpickleWrapper(sampler))
         if self.n_objectives == 1:
-            logger.info("The environment has one objective: MOMBA trains it as single-objective SimbaV2-SAC.")
+            logger.info(
+                "The environment has one objective: MOMBA trains it as single-objective SAC, with %s.",
+                self.policy_class.__name__,
+            )
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed torch, numpy, the environments, the action space and the replay buffer."""
@@ -256,6 +349,16 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         finally:
             for _, one in callbacks_below(self._root_callback):
                 getattr(one, "after_learn", lambda: None)()
+
+    def dump_logs(self) -> None:
+        """Write the log, with the means of the training metrics since the last time."""
+        if self._metrics.sums:
+            self._metrics.record(self.logger)
+            self.logger.record("train/return_scale", self.policy.return_scale.factor)
+            self.logger.record("train/actor_weight_norm", weight_norm(self.actor))
+            self.logger.record("train/critic_weight_norm", weight_norm(self.critic))
+            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        super().dump_logs()
 
     @property
     def remaining_timesteps(self) -> int:
