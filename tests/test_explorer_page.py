@@ -1,10 +1,13 @@
 """A report in a browser: opened from disk, used by mouse and by keyboard, on a screen and on a phone's."""
 
+import io
 from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from sb3_momba.explorer.report import write_report
@@ -142,6 +145,25 @@ def test_on_a_phone_nothing_overflows(browser, real_report):
     watched.close()
 
 
+def test_points_that_lie_close_are_seen(browser, tmp_path):
+    # Steps of a pixel: were points outlined in white, each but the last would be white around its centre.
+    dense = [[500.0 - 0.1 * k, 2_474.0 + 1.5 * k] for k in range(13)]
+    values = np.array([[2_450.0, 1_430.0], [1_500.0, 2_170.0], *dense])
+    folder = write_run(tmp_path / "run", values, simplex(2, len(values)), env="MO-HalfCheetah-v4")
+    write_report([folder], tmp_path / "report.html")
+    watched = Watched(browser, tmp_path / "report.html")
+    image = imread(io.BytesIO(watched.page.locator("#front").screenshot()))
+    places = watched.page.evaluate(
+        """(values) => { const { xaxis, yaxis } = document.getElementById("front")._fullLayout;
+            return values.map(([x, y]) => [xaxis._offset + xaxis.d2p(x), yaxis._offset + yaxis.d2p(y)]); }""",
+        dense,
+    )
+    for x, y in places:
+        for aside in (-3, 0, 3):
+            assert image[round(y), round(x) + aside, 0] < 0.5  # of red, which #0072b2 has none of; white has 1
+    watched.close()
+
+
 @pytest.mark.parametrize("n_objectives", [1, 3, 10], ids="{} objectives".format)
 def test_other_numbers_of_objectives(n_objectives, browser, tmp_path):
     preferences = simplex(n_objectives, 6)
@@ -159,6 +181,16 @@ def test_other_numbers_of_objectives(n_objectives, browser, tmp_path):
     np.testing.assert_allclose([float(cell) for cell in cells], expected, rtol=1e-3)
     assert page.evaluate("document.getElementById('front').data.at(-1).x.length") == (1 if n_objectives == 3 else n_objectives)
     assert watched.overflowing() == []
+    if n_objectives == 10:
+        words = page.eval_on_selector_all(
+            "#front .xtick text, #front .annotation-text",
+            """(every) => every.filter((one) => one.checkVisibility({ visibilityProperty: true, opacityProperty: true }))
+                .map((one) => { const { left, right, top, bottom } = one.getBoundingClientRect();
+                    return [left, right, top, bottom]; })""",
+        )
+        assert len(words) == 30  # a name and two ends of each axis
+        for (left, right, top, bottom), other in combinations(words, 2):
+            assert right <= other[0] or other[1] <= left or bottom <= other[2] or other[3] <= top
     watched.close()
 
 

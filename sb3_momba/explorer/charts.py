@@ -26,6 +26,7 @@ INK, MUTED, GRID = "#1f2933", "#52606d", "#e4e7eb"
 TICKS = {"separatethousands": True, "exponentformat": "SI"}
 CURVES = {"hypervolume": "Hypervolume", "expected_utility": "Expected utility", "preference_regret": "Preference regret"}
 LONGEST_LABEL, LONGEST_NAME = 80, 20  # characters
+SEE_THROUGH = 0.6  # opacity of a point: where several lie it is darker
 
 
 def as_label(text: str) -> str:
@@ -176,7 +177,8 @@ def _points(
             "size": size_on_front if is_front else size,
             "color": colour_of(i),
             "symbol": SYMBOLS[i % len(SYMBOLS)],
-            "line": {"width": 0 if n_objectives == 3 else 1, "color": "white"},
+            "opacity": SEE_THROUGH if n_objectives == 2 and is_front else 1.0,
+            "line": {"width": 0},  # An outline of another colour would erase points that lie close together.
         },
         "line": {"color": colour_of(i), "width": 1},
         "customdata": [[i, int(k)] for k in order for _ in range(repeats)],
@@ -277,14 +279,19 @@ def _front_layout(objectives: Sequence[str], ranges: Array, n_runs: int, quantit
         view = {"camera": camera, "aspectmode": "cube", "dragmode": "turntable"}
         return {**_layout(_axis(""), _axis("")), **legend, "scene": {**scene, **view}}
     x = _axis("", range=[-0.3, n - 0.7], tickvals=list(range(n)), ticktext=_short_names(objectives), gridcolor="#9aa5b1")
-    x["tickangle"] = 0 if n < 5 else -40
-    y = _axis("", range=[-0.12, 1.12], showticklabels=False, showgrid=False)
-    notes = [
-        {"x": k, "y": end, "text": number(float(bound[k])), "showarrow": False, "yshift": -12 if end == 0 else 12}
-        for end, bound in enumerate((low, high))
-        for k in range(n)
-    ]
-    return {**_layout(x, y), **legend, "annotations": notes}
+    # Upright, many names and numbers fit beside each other on a phone, and none reaches beyond an edge.
+    angle, length, above = (0, 20, 0.12) if n < 5 else (-90, 52, 0.3)
+    x |= {"tickangle": angle, "ticklabelstandoff": length, "showline": False}
+    y = _axis("", range=[-0.03, 1 + above], showticklabels=False, showgrid=False, showline=False)
+    note = {"showarrow": False, "textangle": angle, "bgcolor": "white"}
+    lowest = {**note, "yref": "paper", "y": 0, "yanchor": "top"}  # between the axis and its name
+    highest = {**note, "y": 1, "yanchor": "bottom", "yshift": 6}
+    ends = ((lowest, low), (highest, high))
+    notes = [{**end, "x": k, "text": number(float(one))} for end, row in ends for k, one in enumerate(row)]
+    layout = {**_layout(x, y), **legend}
+    layout["margin"]["t"] = 24
+    layout["legend"].update(yref="container", y=0)
+    return {**layout, "annotations": notes}
 
 
 def _short_names(objectives: Sequence[str]) -> list[str]:
