@@ -48,7 +48,7 @@ setup(
         "baselines": ["morl-baselines>=1.3"],
         "benchmark": ["ray[tune]>=2.40"],  # sweeps; grids on one machine need nothing
         "docs": ["sphinx>=8", "myst-parser>=4", "furo>=2024.8"],
-        "explorer": ["plotly>=6", "imageio-ffmpeg>=0.5"],
+        "explorer": ["plotly>=6", "imageio-ffmpeg>=0.5", "onnx>=1.16"],  # the last one for policies that are kept
         "export": ["onnx>=1.16"],  # .onnx files; TorchScript needs nothing
         "hub": ["huggingface_hub>=0.30"],
         "zoo": ["rl_zoo3>=2.9,<3", "seaborn>=0.13", "pandas>=2.2,<3"],  # the last two for its plots
