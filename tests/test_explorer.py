@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
@@ -22,11 +23,11 @@ from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.explorer import charts, report
 from sb3_momba.explorer.__main__ import main
 from sb3_momba.explorer.reading import read_run, read_runs
-from sb3_momba.explorer.rendering import Policy, RenderingProcess, film, record_episode, stride_of
+from sb3_momba.explorer.rendering import Policy, RenderingProcess, film, quieten, record_episode, stride_of
 from sb3_momba.explorer.report import add_films, fill, json_in_html, page_file, spread_out, to_html
 from sb3_momba.explorer.stage import RenderingError, Stage, backends, camera_on, follow
 from sb3_momba.explorer.strobe import draw_strobe
-from tests.explorer_runs import NUMBERS, TINY, needs_gl, simplex, train_tiny, write_run
+from tests.explorer_runs import NUMBERS, TINY, fail, needs_gl, simplex, train_tiny, write_run
 from tests.stubs import tiny_model
 
 VALUES = np.array([[0.0, 10.0], [6.0, 6.0], [10.0, 0.0]])
@@ -228,6 +229,25 @@ def test_the_users_choice_of_opengl_is_the_only_one_tried(monkeypatch):
         backends()
 
 
+def test_a_name_that_mujoco_does_not_know_is_for_whoever_draws():
+    code = "import sb3_momba; from sb3_momba.explorer.stage import backends; backends()"
+    environment = {**os.environ, "MUJOCO_GL": "vulkan"}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert "RenderingError: the environment variable MUJOCO_GL is 'vulkan': leave it out" in ended.stderr
+
+
+def test_what_rounding_does_to_bounds_is_no_news():
+    bound = np.full(1, 0.1)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        gym.spaces.Box(-bound, bound, dtype=np.float32)
+        n = len(warned)
+        quieten()
+        gym.spaces.Box(-bound, bound, dtype=np.float32)
+    assert n > 0
+    assert len(warned) == n
+
+
 def test_a_model_of_another_environment(tiny_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(tiny_run, folder)
@@ -387,6 +407,8 @@ def test_strobe_pictures_that_cannot_be(tiny_run, tmp_path):
     path = tmp_path / "strobe.png"
     with pytest.raises(ValueError, match="sums to"):
         draw_strobe(tiny_run, path, [[0.5, 0.7]])
+    fail(["strobe", tiny_run, "--output", path, "--preferences", "1,0", "-0.5,1.5"], "has a negative weight")
+    fail(["strobe", tiny_run, "--output", path, "--preferences", "-0.5,1.5"], "has a negative weight")
     with pytest.raises(ValueError, match="--poses 0"):
         draw_strobe(tiny_run, path, n_poses=0)
     folder = write_run(tmp_path / "run", VALUES, PREFERENCES)

@@ -292,7 +292,8 @@ def with_model(folder: Path, model: Path) -> Path:
 
 def test_what_cannot_be_chosen_from_is_refused(run_folder, vector_model, tmp_path):
     fail(["live", tmp_path / "nothing"], "is no run: it does not exist")
-    fail(["live", run_folder / "model.zip"], "is a file, not a folder")
+    fail(["live", run_folder / "model.zip"], "model.zip is a file: say also what environment it acts in, --env ID")
+    fail(["report", run_folder / "model.zip"], "is a file, not a folder")
     fail(["live", run_folder, "--env", "MO-Hopper-v4"], "is no file")
     fail(["live", run_folder / "model.zip", "--env", "MO-HalfCheetah-v4"], "observation_space has shape")
     fail(["live", run_folder / "model.zip", "--env", "Nonsense-v0"], "Nonsense")
@@ -301,7 +302,7 @@ def test_what_cannot_be_chosen_from_is_refused(run_folder, vector_model, tmp_pat
     fail(["live", no_model], "has no policy to choose a preference for.*model.zip")
     one = np.array([[0.5, 0.5]])
     one_point = write_run(tmp_path / "one", values[:1], one, returns=values[None, :1])
-    fail(["live", with_model(one_point, vector_model)], "has one point")
+    fail(["live", with_model(one_point, vector_model)], r"has one point, of the preference \(0.5, 0.5\)")
     other = write_run(tmp_path / "other", values, np.eye(2), env="MO-HalfCheetah-v4")
     fail(["live", with_model(other, vector_model)], "observation_space has shape")
     fail(["live", run_folder, "--seeds", other], "a run of MO-HalfCheetah-v4, not of MO-Hopper-v4")

@@ -130,6 +130,15 @@ def test_a_bound_that_nothing_keeps_is_said(page):
 
 @needs_browser
 @needs_gl
+def test_a_negative_difference_is_no_bound(page, watched):
+    ask_for(page, "less", -5)
+    page.wait_for_selector("#bound-answer .bad")
+    assert text(page, "#bound-answer") == "How much less it may be is 0 or more."
+    assert watched.said == []  # The server was not asked, whose refusal browsers log.
+
+
+@needs_browser
+@needs_gl
 def test_a_bound_asked_for_while_the_page_is_busy(page, kit, monkeypatch):
     """It waits for the film that is being made, which is not shown any more, and is found."""
     go_on, show_film = threading.Event(), kit.show_film

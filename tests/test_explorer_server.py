@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sb3_momba.explorer.kit import DecisionKit
-from sb3_momba.explorer.live import LiveServer, NewestFirst, SupersededError, is_loopback
+from sb3_momba.explorer.live import LiveServer, NewestFirst, SupersededError, is_loopback, listen
 from sb3_momba.explorer.opening import open_kit
 from tests.explorer_runs import fail, serving, train_tiny
 
@@ -79,6 +79,7 @@ def test_only_the_page_is_answered(server):
     ("path", "question", "words"),
     [
         ("/predict", b"{", "Expecting"),
+        ("/predict", b"[" * 60_000, "no JSON"),
         ("/predict", [], "no JSON object"),
         ("/predict", {}, "give a list of 2 weights"),
         ("/predict", {"preference": "x"}, "give a list of 2 weights"),
@@ -94,7 +95,7 @@ def test_only_the_page_is_answered(server):
         ("/keep", {"preference": ["../x", 1]}, "not an array"),
     ],
     ids=[
-        *["no JSON", "a list", "nothing", "a word", "a table", "too much", "negative", "too many"],
+        *["no JSON", "too deep", "a list", "nothing", "a word", "a table", "too much", "negative", "too many"],
         *["no such objective", "a flag", "no bound", "a negative one", "a bound in words", "a path"],
     ],
 )
@@ -189,7 +190,19 @@ def test_rollouts_asked_for_at_once_are_whole(server, kit):
 def test_a_port_in_use_is_named_before_anything_is_rolled_out(server, kit):
     port = server.server_address[1]
     fail(["live", kit.run.record.path.parent, "--port", port], rf"127.0.0.1:{port} cannot be listened on \(.*\): try --port 0")
-    fail(["live", kit.run.record.path.parent, "--port", 70_000], "127.0.0.1:70000 cannot be listened on")
+    fail(
+        ["live", kit.run.record.path.parent, "--port", 70_000],
+        "--port 70000: give a number from 1 to 65535, or 0 for a free port",
+    )
+    with pytest.raises(OSError, match=r"^[^()]*\(Address already in use\): try --port 0.$"):
+        listen("127.0.0.1", port)
+
+
+def test_a_host_that_is_not_this_machine_is_named():
+    with pytest.raises(OSError, match=r"--host nowhere\.invalid is no name or address that is known here"):
+        listen("nowhere.invalid", 0)
+    with pytest.raises(OSError, match=r"--host 192\.0\.2\.1 is no address of this machine"):
+        listen("192.0.2.1", 0)
 
 
 def test_everyone_is_let_in_with_a_warning_only(caplog, tmp_path):

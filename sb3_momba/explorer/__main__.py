@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 import logging
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import gymnasium as gym
 
 from sb3_momba.explorer import live
 from sb3_momba.explorer.opening import write_calibration
+from sb3_momba.explorer.rendering import quieten
 from sb3_momba.explorer.report import write_report
 from sb3_momba.explorer.stage import RenderingError
 from sb3_momba.explorer.strobe import draw_strobe
@@ -48,8 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     calibrating.add_argument("--preferences", type=int, default=100, help="drawn at random; by default %(default)s")
     calibrating.add_argument("--output", type=Path, help="the picture; by default calibration.png beside MODEL")
 
-    given = parser.parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    # argparse takes "-0.5,1.5" for an option, but not behind a space: what is wrong with it is said where weights are checked.
+    given = parser.parse_args([f" {word}" if re.match(r"-[\d.]+,", word) else word for word in words])
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    quieten()
     try:
         if given.command == "live":
             with contextlib.suppress(KeyboardInterrupt):

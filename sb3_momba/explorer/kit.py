@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sb3_momba import MOMBA, __version__
 from sb3_momba.envs.preferences import check_preference, preference_grid
+from sb3_momba.explorer.charts import number
 from sb3_momba.explorer.decisions import Bound, exchange_rates, find_alternatives, predict_returns, rank_for_bound
 from sb3_momba.explorer.prediction import CRITIC, FRONT, Predictor, predictors_of, sizes
 from sb3_momba.explorer.reading import Run, objectives_of
@@ -181,8 +182,8 @@ class DecisionKit:
                 "preference": self.survey.front.preferences[one.index].tolist(),
                 "returns": returns[one.index].tolist(),
                 "distance": one.distance,
-                "differs": f"{self.feature(one.feature)}: {two_digits(others[one.index, one.feature])} instead of "
-                f"{two_digits(behaviour[one.feature])}",
+                "differs": f"{self.feature(one.feature)}: {number(others[one.index, one.feature])} instead of "
+                f"{number(behaviour[one.feature])}",
             }
             for one in found
         ]
@@ -296,8 +297,3 @@ def finite(x: Array) -> list[Any]:
     known = x.astype(object)
     known[~np.isfinite(x)] = None
     return list(known.tolist())
-
-
-def two_digits(x: float) -> str:
-    """Without a sign where nothing is left of a number."""
-    return f"{round(float(x), 2) + 0.0:.2f}"

@@ -5,10 +5,12 @@ told otherwise, refuses requests that come by a name it does not know (DNS rebin
 no files that a request names, and writes into one folder.
 """
 
+import errno
 import html
 import ipaddress
 import json
 import logging
+import os
 import re
 import socket
 import sys
@@ -30,7 +32,7 @@ from sb3_momba.explorer.opening import open_kit
 from sb3_momba.explorer.rendering import FPS
 from sb3_momba.explorer.report import fill, film_numbers, json_in_html, page_file, plotly_script
 
-HOST, PORT = "127.0.0.1", 8765
+HOST, PORT, LAST_PORT = "127.0.0.1", 8765, 65_535
 LONGEST_REQUEST = 65_536  # bytes
 SLOWEST_CLIENT = 30.0  # seconds
 PAGE_POLICY = (
@@ -195,7 +197,7 @@ class Handler(BaseHTTPRequestHandler):
         start = time.perf_counter()
         try:
             asked = json.loads(body)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise QuestionError(f"The request is no JSON: {error}") from error
         if not isinstance(asked, dict):
             raise QuestionError("The request is no JSON object.")
@@ -304,12 +306,21 @@ def listen(host: str, port: int) -> socket.socket:
     """
     :param host: a name or an address
     :param port: 0 takes a free one
+    :raises ValueError: for a number that is no port
     :raises OSError: if it is in use, or cannot be had
     """
+    if not 0 <= port <= LAST_PORT:
+        raise ValueError(f"--port {port}: give a number from 1 to {LAST_PORT}, or 0 for a free port.")
+    try:
+        socket.getaddrinfo(host, port)
+    except socket.gaierror as error:
+        raise OSError(f"--host {host} is no name or address that is known here ({error.strerror}).") from error
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-    except (OSError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or error
+    except OSError as error:
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise OSError(f"--host {host} is no address of this machine.") from error
+        why = os.strerror(error.errno) if error.errno else error  # Its own text has the address once more.
         raise OSError(f"{host}:{port} cannot be listened on ({why}): try --port 0.") from error
 
 

@@ -42,6 +42,8 @@ def open_kit(
     :param films: whether they are wanted
     :raises ValueError: for what there is nothing to decide about, saying why
     """
+    if env is None and path.is_file():
+        raise ValueError(f"{path} is a file: say also what environment it acts in, --env ID, or give the folder of its run.")
     run = model_alone(path, env) if env is not None else read_run(path)
     if env is None and (run.model is None or run.preferences is None):
         raise ValueError(f"{path} has no policy to choose a preference for. {run.no_films}")
@@ -52,8 +54,9 @@ def open_kit(
     if n_objectives < 2:
         raise ValueError(f"{path} has one objective: there is no trade-off to choose.")
     if run.front is not None and len(np.unique(run.front.preferences, axis=0)) < 2:
+        weights = ", ".join(f"{weight:.4g}" for weight in run.front.preferences[0])
         raise ValueError(
-            f"The front of {path} has one point, of the preference {run.front.preferences[0].tolist()}: there is nothing to "
+            f"The front of {path} has one point, of the preference ({weights}): there is nothing to "
             "choose between. Give a run that was evaluated under several preferences, or its model.zip with --env."
         )
     others = [other_seed(one, run, model.gamma) for one in seeds]

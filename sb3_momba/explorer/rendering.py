@@ -7,6 +7,7 @@ import importlib.util
 import os
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -245,8 +246,14 @@ def _load_version(path: Path, _written: int) -> MOMBA:
     return MOMBA.load(path, device="cpu")
 
 
-def end_with_parent() -> None:
-    """Let no one be left behind where this process is killed, or ended by a signal that it does not handle."""
+def quieten() -> None:
+    """Without Gymnasium's warnings of what rounding does to the bounds of a space, one for each environment that is made."""
+    warnings.filterwarnings("ignore", message=r".*precision lowered by casting")
+
+
+def begin_process() -> None:
+    """Let no one be left behind where the parent is killed, or ended by a signal that it does not handle."""
+    quieten()
 
     def watch() -> None:
         parent = parent_process()
@@ -271,7 +278,7 @@ class RenderingProcess:
             self._choose_backend()
 
     def _start(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent)
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=begin_process)
 
     def _choose_backend(self) -> None:
         reasons = []

@@ -281,6 +281,7 @@
     const before = preference;
     const objective = Number(at("bound-objective").value);
     const value = Number(at("bound-value").value);
+    if (at("bound-kind").value === "less" && value < 0) throw new Error("How much less it may be is 0 or more.");
     const current = begin("bound");
     const bound = { preference, objective, [at("bound-kind").value]: value };
     const found = await ask("/bound", bound).catch((error) => ({ error }));
