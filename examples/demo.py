@@ -40,6 +40,9 @@ def main(steps: int = 25_000) -> None:
     print(report(result))
     floor = max(metrics["hypervolume"] for metrics in result.floors.values())
     print(f"Hypervolume {result.front.hypervolume() / floor:.1f} times that of the better of the two that learned nothing.")
+    print("\nTo see it in a browser, with films of the policy:")
+    print("  .venv/bin/pip install -c constraints.txt -e '.[explorer]'")
+    print(f"  .venv/bin/python -m sb3_momba.explorer report {result.folder}")
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ def test_the_demo(tmp_path):
     assert "times that of the better of the two that learned nothing" in said
     (folder,) = (tmp_path / "runs" / "demo").iterdir()
     assert (folder / "model.zip").exists()
+    assert said.endswith(f"-m sb3_momba.explorer report {folder.relative_to(tmp_path)}\n")
 
 
 def test_an_environment_of_ones_own(tmp_path):
