@@ -20,8 +20,9 @@ from sb3_momba.baselines import dpmorl
 from sb3_momba.baselines import runs as baseline_runs
 from sb3_momba.baselines.__main__ import main, parse
 from sb3_momba.baselines.dpmorl import rollout_steps
-from sb3_momba.baselines.pgmorl import CLIP, EPSILON, schedule
+from sb3_momba.baselines.judging import CLIP, EPSILON
 from sb3_momba.baselines.runs import Baseline, make_baseline, run
+from sb3_momba.baselines.schedules import OF_OTHERS, SCRIPTS, Script, default_steps, iterations, schedule
 from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
 from sb3_momba.benchmark.__main__ import main as benchmark
 from sb3_momba.envs.pgmorl import TASKS
@@ -58,6 +59,18 @@ class Steer(gym.Env):
         return np.array([10 * self.x, self.t / EPISODE])
 
 
+class Gust(Steer):
+    """The same in a wind, and over where the point leaves the field."""
+
+    deterministic = False
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool, dict[str, Any]]:
+        self.x += 0.2 * self.np_random.standard_normal()
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, abs(self.x) > 1, False, info
+
+
+gym.register("Gust2-v0", Gust, max_episode_steps=EPISODE, disable_env_checker=True)
 for number in (1, 2, 3, 4):
     gym.register(
         f"Steer{number}-v0", Steer, max_episode_steps=EPISODE, disable_env_checker=True, kwargs={"n_objectives": number}
@@ -160,14 +173,6 @@ def test_one_episode_stands_for_all_where_nothing_is_random(tiny) -> None:
     assert (front["settings"]["deterministic_policy"], front["settings"]["deterministic_env"]) == (True, True)
 
 
-def test_values_are_raw_returns(tiny) -> None:
-    """Within what this task can give, which normalised, clipped or discounted returns are not."""
-    values = tiny.record.final_values
-    total = EPISODE * (8 - 2)  # both distances add up to 2 between the goals, and to more beyond
-    assert (values.sum(axis=1) <= total + 1e-9).all()
-    assert (values > EPISODE * 0.5).all()
-
-
 def test_the_same_seed_gives_the_same_record(tiny, tmp_path) -> None:
     def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
         drop = ("seconds", "cpu_seconds", "evaluation_seconds", "started")
@@ -177,19 +182,22 @@ def test_the_same_seed_gives_the_same_record(tiny, tmp_path) -> None:
     assert without_times(again.lines) == without_times(tiny.lines)
 
 
-@pytest.mark.parametrize("algorithm", ["gpi_ls", "dpmorl"])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_three_objectives(tmp_path, algorithm: str) -> None:
-    settings = settings_of(algorithm, tmp_path / "run", env="Steer3-v0", eval_freq=10_000)
-    settings.hyperparameters.update({"num_eval_episodes_for_front": 1} if algorithm == "gpi_ls" else {})
+    steps = {**STEPS, "pgmorl": 5 * 16 * 2 * 6}[algorithm]
+    settings = settings_of(algorithm, tmp_path / "run", env="Steer3-v0", eval_freq=10_000, steps=steps)
+    more = {"gpi_ls": {"num_eval_episodes_for_front": 1}, "pgmorl": {"delta_weight": 0.5}, "dpmorl": {}}
+    settings.hyperparameters.update(more[algorithm])
     run(settings)
     record = read_record(tmp_path / "run" / "record.jsonl")
     assert record.error is None
     assert record.final_values.shape[1] == record.preferences.shape[1] == 3
 
 
-@pytest.mark.parametrize("algorithm", ["gpi_ls", "dpmorl"])
-def test_evaluations_do_not_change_the_training(tmp_path, algorithm: str) -> None:
-    often, never = (run(settings_of(algorithm, tmp_path / str(n), eval_freq=n)) for n in (20, 10_000))
+@pytest.mark.parametrize("env", [ENV, "Gust2-v0"])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_evaluations_do_not_change_the_training(tmp_path, algorithm: str, env: str) -> None:
+    often, never = (run(settings_of(algorithm, tmp_path / str(n), env=env, eval_freq=n)) for n in (20, 10_000))
     assert len(often.timesteps) >= 4
     assert len(never.timesteps) == 1
     assert often.metrics[-1] == never.metrics[-1]
@@ -239,18 +247,19 @@ def by_hand(trained: Any, algorithm: str) -> list[np.ndarray]:
             roll_out(lambda s, z, n=net, w=w: n(th.tensor(s).float()[None], w[None]).detach().numpy()[0]) for net, w in networks
         ]
     if algorithm == "pgmorl":
-        found = []
-        assert [one.policy for one in trained.archived.values()] == trained.agent.archive.individuals
-        pairs = [(one.policy, one.statistics) for one in trained.archived.values()]
-        for policy, statistics in [*pairs, *((policy, trained.statistics) for policy in trained.agent.agents)]:
-
-            def act(s: np.ndarray, z: np.ndarray, net: Any = policy.networks.actor_mean, of: Any = statistics) -> np.ndarray:
-                normalized = np.clip((s - of.mean) / np.sqrt(of.variance + EPSILON), -CLIP, CLIP)
-                return np.clip(net(th.tensor(normalized).float()[None]).detach().numpy()[0], -1, 1)
-
-            found.append(roll_out(act))
-        return found
+        return [of_pgmorl(policy.networks) for policy in trained.agent.archive.individuals]
     raise AssertionError(algorithm)
+
+
+def of_pgmorl(network: Any) -> np.ndarray:
+    """The return of one of PGMORL's networks, with its statistics."""
+    of = network.statistics
+
+    def act(s: np.ndarray, z: np.ndarray) -> np.ndarray:
+        normalized = np.clip((s - of.mean) / np.sqrt(of.variance + EPSILON), -CLIP, CLIP)
+        return np.clip(network.actor_mean(th.tensor(normalized).float()[None]).detach().numpy()[0], -1, 1)
+
+    return roll_out(act)
 
 
 def test_an_evaluation_is_a_rollout_by_hand(tiny) -> None:
@@ -277,14 +286,14 @@ def test_an_evaluation_of_dpmorl_shows_its_policies_their_returns(tmp_path) -> N
 def test_the_statistics_of_pgmorl_are_of_all_its_environments(tiny) -> None:
     trained = tiny.trained
     if tiny.settings.algorithm != "pgmorl":
-        assert not hasattr(trained, "statistics")
+        assert not hasattr(trained, "judge")
         return
     seen = [env.get_wrapper_attr("obs_rms") for env in trained.agent.env.envs]
     counts = np.array([one.count for one in seen])
     mean = np.average([one.mean for one in seen], axis=0, weights=counts)
     squares = np.average([one.var + one.mean**2 for one in seen], axis=0, weights=counts)
-    np.testing.assert_allclose(trained.statistics.mean, mean)
-    np.testing.assert_allclose(trained.statistics.variance, squares - mean**2)
+    np.testing.assert_allclose(trained.judge.statistics.mean, mean)
+    np.testing.assert_allclose(trained.judge.statistics.variance, squares - mean**2)
     assert counts.sum() > STEPS["pgmorl"]  # resets are seen too
 
 
@@ -301,39 +310,98 @@ def test_steps_of_the_algorithms_own_episodes_are_counted(tmp_path) -> None:
 
 def test_the_extra_steps_by_hand(tiny) -> None:
     algorithm, extra = tiny.settings.algorithm, tiny.lines[-1]["extra_steps"]
-    if algorithm == "pgmorl":  # an episode of each of 4 policies: at the start, after the warm-up, after the one generation
-        assert extra == 3 * 4 * EPISODE
+    if algorithm == "pgmorl":  # an episode of each of 4 policies: at the start, and after each of 5 iterations
+        assert extra == (1 + 5) * 4 * EPISODE
     if algorithm == "dpmorl":  # of random actions
         assert extra == 3 * EPISODE
 
 
-def judged(tmp_path: Path, **more: Any) -> Any:
-    """PGMORL after its policies were judged once."""
-    made: Any = make_baseline(settings_of("pgmorl", tmp_path, hyperparameters={**TINY["pgmorl"], **more}), 2)
-    made.agent._PGMORL__eval_all_agents(made.eval_env, [np.zeros(2)] * 4, np.zeros(2), add_to_prediction=False)
-    made.close()
-    return made
-
-
 def test_pgmorl_judges_by_raw_returns(tmp_path) -> None:
-    made = judged(tmp_path)
+    made: Any = make_baseline(settings_of("pgmorl", tmp_path), 2)
+    made.judge.begin()
     assert made.extra_steps == 4 * EPISODE
-    expected = made.evaluate(np.eye(2))
-    n = len(made.agent.archive.evaluations)
-    assert expected.settings["archived"] == n > 0
-    np.testing.assert_allclose(made.agent.archive.evaluations, expected.values[:n])
-    earned = {tuple(value) for value in expected.values[n:]}
-    assert len(earned) == 4
-    assert {tuple(value) for value in made.agent.population.evaluations} <= earned
+    assert (made.agent.archive.evaluations, made.agent.population.evaluations) == ([], [])
+    made.judge.judge(is_generation=True)
+    made.close()
+    assert made.extra_steps == 2 * 4 * EPISODE
+    earned = [of_pgmorl(policy.networks) for policy in made.agent.agents]
+    for found in (made.agent.predictor.previous_performance, made.agent.predictor.next_performance):
+        np.testing.assert_allclose(found, earned, rtol=1e-5)
+    found = made.agent.archive.evaluations
+    np.testing.assert_allclose(found, made.evaluate(np.eye(2)).values)
+    assert 0 < len(found) <= 4
+    judged = {tuple(value) for value in made.agent.predictor.next_performance}
+    assert {tuple(value) for value in (*found, *made.agent.population.evaluations)} <= judged
 
 
 def test_pgmorl_can_judge_as_the_library_does(tmp_path) -> None:
     """Five stochastic episodes for each policy; its numbers are not those of the record."""
-    made = judged(tmp_path, library_evaluation=True)
-    assert made.extra_steps == 4 * 5 * EPISODE
-    assert max(map(max, made.agent.archive.evaluations)) > 0
-    values = made.evaluate(np.eye(2)).values
-    assert not any(np.allclose(value, earned) for value in values for earned in made.agent.archive.evaluations)
+    hyperparameters = {**TINY["pgmorl"], "library_evaluation": True}
+    made: Any = make_baseline(settings_of("pgmorl", tmp_path, hyperparameters=hyperparameters), 2)
+    made.train(lambda: None)
+    made.close()
+    assert made.extra_steps == 3 * 4 * 5 * EPISODE  # at the start, after the warm-up, after the one generation
+    assert len(made.agent.predictor.used_weight) == 2 * 4
+    values, judged = made.evaluate(np.eye(2)).values, made.agent.archive.evaluations
+    assert len(values) == len(judged) > 0
+    assert not any(np.allclose(value, earned) for value in values for earned in judged)
+
+
+def flat_parameters(network: Any) -> tuple[float, ...]:
+    return tuple(th.nn.utils.parameters_to_vector(network.parameters()).tolist())
+
+
+@pytest.fixture(scope="module")
+def lineage(tmp_path_factory) -> SimpleNamespace:
+    """PGMORL over a warm-up of 4 iterations, generations of 2 and a last one of 1: what each policy was when it was chosen."""
+    hyperparameters = {**TINY["pgmorl"], "warmup_iterations": 4, "evolutionary_iterations": 2}
+    made: Any = make_baseline(
+        settings_of("pgmorl", tmp_path_factory.mktemp("x"), steps=9 * 128, hyperparameters=hyperparameters), 2
+    )
+    agent, seen = made.agent, SimpleNamespace(made=made, parents=[], candidates=0, seeds=set())
+    choose, watched = type(agent)._PGMORL__task_weight_selection, type(agent)
+
+    def choosing(self: Any, *args: Any, **kwargs: Any) -> None:
+        members = zip(agent.population.individuals, agent.population.evaluations, strict=True)
+        earned = {flat_parameters(policy.networks): value for policy, value in members}
+        choose(self, *args, **kwargs)
+        seen.parents.append([earned[flat_parameters(policy.networks)] for policy in agent.agents])
+        seen.seeds |= {policy.seed for policy in agent.agents}
+
+    def between_steps() -> None:
+        seen.candidates += 4
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watched, "_PGMORL__task_weight_selection", choosing)
+        seen.first = [policy.networks for policy in agent.agents]
+        made.train(between_steps)
+    made.close()
+    return seen
+
+
+def test_pgmorl_predicts_from_what_parents_and_children_earned(lineage) -> None:
+    """Samples at the iterations 2 and 4 of the warm-up and at the ends of the generations, 6 and 8: four policies each."""
+    predictor = lineage.made.agent.predictor
+    before, after = (np.reshape(x, (4, 4, 2)) for x in (predictor.previous_performance, predictor.next_performance))
+    assert len(lineage.parents) == 3
+    np.testing.assert_array_equal(before[1], after[0])  # in the warm-up each policy is its own parent
+    np.testing.assert_array_equal(before[2], lineage.parents[0])
+    np.testing.assert_array_equal(before[3], lineage.parents[1])
+    chosen_from_others = [not np.array_equal(parents, slots) for parents, slots in zip(before[2:], after[1:3], strict=True)]
+    assert any(chosen_from_others)
+
+
+def test_pgmorl_ends_with_a_generation_that_fits(lineage) -> None:
+    assert lineage.made.steps == 9 * 128
+    assert lineage.made.extra_steps == (1 + 9) * 4 * EPISODE
+
+
+def test_what_pgmorl_keeps_has_no_rollouts_and_what_it_trains_the_runs_seed(lineage) -> None:
+    agent = lineage.made.agent
+    assert all(policy.batch is None for policy in (*agent.archive.individuals, *agent.population.individuals))
+    assert all(policy.batch.obs.shape == (16, 2, 2) for policy in agent.agents)
+    assert lineage.seeds == {3}
+    assert all(policy.np_random is agent.np_random for policy in agent.agents)
 
 
 # ---------------------------------------------------------------------------------------------------- tasks and sizes
@@ -388,52 +456,83 @@ def test_each_task_has_actions_for_its_start(of_all_tasks) -> None:
 
 
 @pytest.mark.parametrize(
-    ("iterations", "expected"),
+    ("env", "n", "expected"),
     [
-        (5, (4, 1)),
-        (20, (4, 1)),
-        (61, (13, 3)),
-        (100, (16, 4)),
-        (240, (40, 10)),
-        (244, (44, 10)),
-        (480, (80, 20)),
-        (610, (90, 20)),
+        ("MO-Swimmer-v4", 244, (40, 10)),
+        ("MO-HalfCheetah-v4", 610, (80, 20)),
+        ("MO-Walker2d-v4", 610, (80, 20)),
+        ("MO-Ant-v4", 976, (200, 40)),
+        ("MO-Hopper-v4", 976, (200, 40)),
+        ("MO-Hopper-3obj-v4", 976, (200, 40)),
+        ("MO-Humanoid-v4", 1220, (200, 40)),
     ],
-    ids=lambda x: str(x).replace(", ", "+"),
+    ids=str,
 )
-def test_the_schedule_of_pgmorl(iterations: int, expected: tuple[int, int]) -> None:
-    warmup, generation = schedule(iterations * 49_152, 49_152, None, None)
-    assert (warmup, generation) == expected
-    assert (iterations - warmup) % generation == 0
+def test_the_schedule_of_pgmorl_is_that_of_its_authors(env: str, n: int, expected: tuple[int, int]) -> None:
+    script = SCRIPTS[env]
+    assert n * 2048 * script.num_envs * script.n_policies == script.steps == default_steps("pgmorl", env)
+    assert schedule(n, script) == (script.warmup, script.generation) == expected
 
 
-def test_a_given_schedule_of_pgmorl() -> None:
-    assert schedule(4_915_200, 49_152, 80, 20) == (80, 20)
-    assert schedule(10 * 48, 48, 4, None) == (4, 1)
-    assert schedule(11 * 48, 48, None, 2) == (9, 2)
-
-
-def test_a_schedule_fills_every_number_of_iterations() -> None:
-    for n in range(5, 700):
-        warmup, generation = schedule(n, 1, None, None)
-        assert warmup >= 4 * generation
-        assert 1 <= (n - warmup) // generation <= 32
+def test_the_budgets_of_pgmorl_are_those_of_table_4_2() -> None:
+    """12M to 120M, of 2M to 20M for each policy."""
+    steps = [script.steps for script in SCRIPTS.values()]
+    assert set(SCRIPTS) == set(TASKS)
+    assert (min(steps), max(steps)) == (11_993_088, 119_930_880)
+    assert default_steps("pgmorl", "momba/MO-Humanoid-v4") == 119_930_880
+    assert default_steps("pgmorl", "mine-v0") == OF_OTHERS.steps == 610 * 8192 * 6
+    assert (default_steps("gpi_ls", "MO-Ant-v4"), default_steps("dpmorl", "MO-Ant-v4")) == (200_000, 10_000_000)
 
 
 @pytest.mark.parametrize(
-    ("steps", "given", "message"),
-    [
-        (1_000_000, (None, None), r"49,152 steps.*give 983,040 \(20\) or 1,032,192 \(21\)\.$"),
-        (100_000, (None, None), r"give 245,760 \(5\)\.$"),
-        (98_304, (None, None), r"2 iterations of 49,152: behind a warm-up of 4 .* generations of 1.* Give 245,760 \(5\)"),
-        (491_520, (80, 20), r"10 iterations .* warm-up of 80 .* Give 4,915,200 \(100\)"),
-        (5_013_504, (80, 20), r"102 iterations .* Give 4,915,200 \(100\)"),
-    ],
-    ids=range(5),
+    ("n", "expected"), [(5, (4, 1)), (20, (4, 1)), (61, (12, 3)), (240, (40, 10)), (467, (76, 19)), (468, (200, 20))], ids=str
 )
-def test_steps_that_pgmorl_cannot_divide_are_refused(steps: int, given: tuple[Any, Any], message: str) -> None:
+def test_the_schedule_of_a_short_training(n: int, expected: tuple[int, int]) -> None:
+    assert schedule(n, Script(8_000_000, 200, 20)) == expected
+
+
+def test_a_given_schedule_of_pgmorl() -> None:
+    script = SCRIPTS["MO-HalfCheetah-v4"]
+    assert schedule(100, script, 80, 20) == (80, 20)
+    assert schedule(10, script, 5) == (5, 1)
+    assert schedule(11, script, generation=2) == (8, 2)
+    assert schedule(100, script, generation=20) == (80, 20)
+
+
+def test_every_training_of_pgmorl_has_a_generation() -> None:
+    for n in range(5, 1300):
+        for script in (*SCRIPTS.values(), OF_OTHERS):
+            warmup, generation = schedule(n, script)
+            assert warmup >= 4 * generation
+            assert n > warmup
+
+
+@pytest.mark.parametrize(
+    ("n", "given", "message"),
+    [
+        (2, (None, None), "has 2 iterations, and the warm-up 4: there must be one more"),
+        (80, (80, 20), "has 80 iterations, and the warm-up 80"),
+        (80, (10, 20), "warmup_iterations=10: .* evolutionary_iterations=20"),
+    ],
+    ids=range(3),
+)
+def test_a_schedule_that_cannot_be_is_refused(n: int, given: tuple[Any, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        schedule(steps, 49_152, *given)
+        schedule(n, OF_OTHERS, *given)
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        (1_000_000, r"49,152 steps.*give 983,040 \(20\) or 1,032,192 \(21\)\.$"),
+        (100_000, r"give 245,760 \(5\)\.$"),
+    ],
+    ids=range(2),
+)
+def test_steps_that_are_no_iterations_of_pgmorl_are_refused(steps: int, message: str) -> None:
+    assert iterations(983_040, 49_152) == 20
+    with pytest.raises(ValueError, match=message):
+        iterations(steps, 49_152)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import gymnasium as gym
 
 from sb3_momba.baselines.runs import BaselineResult, run
-from sb3_momba.baselines.settings import STEPS, VARIANTS, BaselineSettings
+from sb3_momba.baselines.schedules import default_steps
+from sb3_momba.baselines.settings import VARIANTS, BaselineSettings
 from sb3_momba.train import add_protocol_arguments, assign, metrics_table, whole_number
 
 
@@ -34,7 +35,7 @@ def parse(arguments: Sequence[str] | None = None) -> BaselineSettings:
         algorithm=algorithm,
         env=given.env,
         output=given.output or f"runs/{given.env}/{given.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}-{given.seed}",
-        steps=STEPS[algorithm] if given.steps is None else given.steps,
+        steps=default_steps(algorithm, given.env) if given.steps is None else given.steps,
         seed=given.seed,
         label=given.label or given.algorithm,
         hyperparameters=hyperparameters,
