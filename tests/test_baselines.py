@@ -276,7 +276,7 @@ def test_an_evaluation_of_dpmorl_shows_its_policies_their_returns(tmp_path) -> N
     made.model.num_timesteps = 8
 
     def act(s: np.ndarray, z: np.ndarray) -> np.ndarray:
-        shown = np.concatenate([s, [(z[0] + 1) / 4, z[1] / 50]]).astype(np.float32)
+        shown = np.concatenate([s, [np.log1p((z[0] + 1) / 4), np.log1p(z[1] / 50)]]).astype(np.float32)
         return made.model.predict(shown, deterministic=True)[0]
 
     np.testing.assert_allclose(made.evaluate(np.eye(2)).values, [roll_out(act)], rtol=1e-5)

@@ -11,7 +11,7 @@ from torch import nn
 
 import sb3_momba.baselines.utilities as utilities_module
 from sb3_momba.baselines.dominance import dominates, non_dominated_distributions
-from sb3_momba.baselines.returns import AccumulatedReturn, UtilityReward, WithoutReward
+from sb3_momba.baselines.returns import AccumulatedReturn, UtilityReward, WithoutReward, symlog
 from sb3_momba.baselines.utilities import (
     LinearUtility,
     MonotoneUtility,
@@ -140,12 +140,12 @@ def test_the_utility_of_returns_by_hand() -> None:
 
 
 def augmented(**kwargs: Any) -> AccumulatedReturn:
-    """Step t gives [t, -10 t]; z is shown as (z - low) / 20 and / 200."""
+    """Step t gives [t, -10 t]; z is shown as the symlog of (z - low) / 20 and / 200."""
     return AccumulatedReturn(StubEnv(**kwargs), LOW, HIGH)
 
 
 def seen(z: tuple[float, float]) -> list[float]:
-    return [(z[0] + 10) / 20, (z[1] + 200) / 200]
+    return [np.log(1 + (z[0] + 10) / 20), np.log(1 + (z[1] + 200) / 200)]  # neither falls below its range
 
 
 def test_the_state_shows_the_return_so_far() -> None:
@@ -163,6 +163,20 @@ def test_the_state_shows_the_return_so_far() -> None:
         assert (terminated, truncated) == (False, t == 3)
     observation, _ = env.reset()
     np.testing.assert_allclose(observation[-2:], seen((0, 0)), rtol=1e-6)
+
+
+def test_symlog_by_hand() -> None:
+    x = np.array([0.0, np.e - 1, 1 - np.e, np.e**2 - 1])
+    np.testing.assert_allclose(symlog(x), [0, 1, -1, 2], atol=1e-12)
+    assert symlog(np.array([1e-6]))[0] == pytest.approx(1e-6, rel=1e-5)
+
+
+def test_a_return_far_beyond_its_range_is_still_seen() -> None:
+    """Forty times the range is less than four, and more than thirty times."""
+    env = AccumulatedReturn(StubEnv(), np.zeros(2), np.ones(2))
+    env.reset()
+    env.z = np.array([40.0, -30.0])
+    assert env._observe(np.zeros(1))[1:].tolist() == pytest.approx([np.log(41), -np.log(31)])
 
 
 def test_the_state_without_the_return() -> None:

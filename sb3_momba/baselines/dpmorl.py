@@ -2,7 +2,7 @@
 
 Utility functions of vector returns are generated that differ from one another; for each one, PPO trains a policy of
 [s_t, z_t], z_t the return so far, on the reward f(z_{t+1}) - f(z_t). The policies whose return distributions no other one
-dominates are the solutions.
+dominates are marked among the solutions.
 """
 
 import warnings
@@ -191,14 +191,14 @@ class Baseline:
         self.high = np.where(self.high > self.low, self.high, self.low + 1)  # An objective of which nothing was seen yet.
 
     def evaluate(self, preferences: np.ndarray) -> SolutionSet:
-        """The policies that are trained, and the one that is being trained, without those that another one dominates.
+        """The policies that are trained, and the one that is being trained. The settings name those that no other one
+        dominates, as distributions of returns.
 
         :param preferences: which no policy answers
         """
         current = [Trained(self.model.policy, self.low, self.high)] if self.model.num_timesteps else []
         played = [self._play(one) for one in (*self.finished, *current)]
-        kept = non_dominated_distributions(np.concatenate([one.returns for one in played]))
-        return as_set([played[i] for i in kept], utilities=kept)
+        return as_set(played, non_dominated=non_dominated_distributions(np.concatenate([one.returns for one in played])))
 
     def _play(self, one: "Trained") -> ParetoFront:
         if one.played is None:

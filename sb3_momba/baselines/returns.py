@@ -11,10 +11,18 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 
+def symlog(x: np.ndarray) -> np.ndarray:
+    """sign(x) ln(1 + |x|) (Hafner et al., 2023, equation 9), elementwise: about x near 0, and small where x is large.
+
+    A policy that learns earns many times what random actions do, by which returns are scaled first.
+    """
+    return np.sign(x) * np.log1p(np.abs(x))
+
+
 class AccumulatedReturn(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Accumulates z_t, the undiscounted vector return of the episode so far, which is 0 at its start.
 
-    - observation: float32 Box [s_t, (z_t - low) / (high - low)]
+    - observation: float32 Box [s_t, symlog((z_t - low) / (high - low))]
     - reward: the environment's own vector
     - `info["accumulated_return"]`: a fresh float64 copy of z_{t+1}, (n_objectives,)
 
@@ -50,7 +58,7 @@ class AccumulatedReturn(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         return self._observe(observation), reward, terminated, truncated, info  # type: ignore[return-value]
 
     def _observe(self, observation: np.ndarray) -> np.ndarray:
-        seen = (self.z - self.low) / self.width if self.augment else ()
+        seen = symlog((self.z - self.low) / self.width) if self.augment else ()
         return np.concatenate([observation, seen]).astype(np.float32)
 
 
