@@ -185,7 +185,7 @@ class Evaluation:
 @dataclass(frozen=True)
 class Record:
     """A record as it was read. `error` is None for a run that finished; one without an end counts as failed. `traceback` is
-    empty where none was recorded."""
+    empty where none was recorded. `extra_steps` are those of episodes that the method played for itself, beside its steps."""
 
     path: Path
     label: str
@@ -203,6 +203,7 @@ class Record:
     final_values: Array | None
     error: str | None
     traceback: str = ""
+    extra_steps: int = 0
 
     @property
     def task(self) -> str:
@@ -282,7 +283,9 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
     final_values: Array | None = None
     error: str | None = UNENDED
     traceback = ""
+    extra_steps = 0
     for event in events[1:]:
+        extra_steps = _whole(event.get("extra_steps", extra_steps), "extra_steps")
         if event["event"] == "resumed" and final_values is None:
             resumed_at = _whole(event["steps"], "steps")
             evaluations = [evaluation for evaluation in evaluations if evaluation.steps <= resumed_at]
@@ -322,6 +325,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         final_values=final_values,
         error=error,
         traceback=traceback,
+        extra_steps=extra_steps,
     )
 
 

@@ -67,6 +67,7 @@ def write_record(
     error: BaseException | str | None = None,
     floors: dict[str, Any] = FLOORS,
     settings: dict[str, Any] | None = None,
+    extra_steps: int | None = None,
     **start: Any,
 ) -> Record:
     """A record of small numbers.
@@ -75,6 +76,7 @@ def write_record(
     :param curve: steps and the values there
     :param error: that it fails with; "cut off": it has no end
     :param settings: added to the configuration
+    :param extra_steps: at the end, if it has one
     """
     config = {**deepcopy(CONFIG), **(settings or {})}
     content = {"label": "a", "env": "E", "env_kwargs": {}, "seed": 0, "config": config, "reference_point": [0.0, 0.0]}
@@ -87,7 +89,8 @@ def write_record(
         writer.append("evaluation", steps=steps, seconds=steps / 10, values=measured)
     if values is not None:
         returns = np.asarray(values, dtype=np.float64)[:, None]
-        writer.finish(max(curve or [100]), {"returns": returns})
+        extra = {} if extra_steps is None else {"extra_steps": extra_steps}
+        writer.finish(max(curve or [100]), {"returns": returns}, **extra)
     elif isinstance(error, BaseException):
         with pytest.raises(type(error)), writer:
             raise error
@@ -798,6 +801,15 @@ def test_seeds_that_other_methods_have_are_named(fake, tmp_path) -> None:
 def test_seeds_that_were_recorded_twice_are_named(fake, tmp_path) -> None:
     text = report_of(tmp_path / "report", [fake(FRONT), fake(FRONT), fake(FRONT, seed=1)])
     assert [line for line in text.splitlines() if "ecorded" in line] == ["Recorded more than once: a, seed 0."]
+
+
+def test_extra_steps_have_a_column_where_there_are_some(fake, tmp_path) -> None:
+    made = [fake(FRONT, {10: FRONT}), fake(FRONT, {10: FRONT}, label="b", extra_steps=3_000)]
+    made += [fake(FRONT, {20: FRONT}, label="b", seed=1, extra_steps=4_000), fake(FRONT, {10: FRONT}, env="F")]
+    text = report_of(tmp_path / "report", made)
+    assert [row[:5] for row in rows_of(text, "a")[:2]] == [["a", "1/1", "10", "0", "210"], ["a", "1/1", "10", "210", "6"]]
+    assert rows_of(text, "b")[0][:5] == ["b", "2/2", "20", "4,000", "210"]
+    assert text.count("| extra steps |") == text.count("not among its steps") == 1
 
 
 # ----------------------------------------------------------------------------------------------------------- aggregate

@@ -8,10 +8,12 @@ from sb3_momba.pareto import protocol
 from sb3_momba.settings import RANGES, check_switch, check_whole, is_number
 
 ALGORITHMS = ("pgmorl", "gpi_ls", "dpmorl")
-# Rows of chapter 4: the algorithm, and what is not its default. UTD 1 is in figure 4.4.
+# Rows of chapter 4: the algorithm, and what is not its default. UTD 1 is in figure 4.4; the parameters of DPMORL in Table 4.2
+# are those of policies that do not see the return so far.
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, {}) for name in ALGORITHMS},
     "gpi_ls_utd_1": ("gpi_ls", {"gradient_updates": 1}),
+    "dpmorl_state": ("dpmorl", {"augment_state": False}),
 }
 STEPS = {"gpi_ls": 200_000, "dpmorl": 10_000_000}  # Table 4.2; PGMORL's depend on the task, see `schedules.py`
 LEAST = {"learning_starts": 0, "batch_size": 2}  # of whole numbers; 1 of others

@@ -25,6 +25,7 @@ COLUMNS = {
     "curve over steps": "mean_over_steps",
     "curve over time": "mean_over_time",
 }
+EXTRA_STEPS = "Extra steps: of episodes that a method plays for itself, which are not among its steps.\n"
 NORMALISED = ("hypervolume", "expected utility", "curve over steps", "curve over time")
 EXPLANATION = """\
 IQM of the runs with its 95 % interval from a stratified bootstrap, which is too narrow where there are few seeds: of normal
@@ -54,6 +55,7 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
         parts.append(f"## {task.name}\n")
         parts.append(f"Reference point {task.reference_point.tolist()}; curves over time up to {task.seconds:,.0f} s.\n")
         parts.append(task_table(task))
+        parts += [EXTRA_STEPS] * has_extra_steps(task)
         parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
         parts += [f"Not recorded: {missing}.\n" for missing in missing_seeds(task)]
         if task.fixed_preference:
@@ -98,11 +100,17 @@ def missing_seeds(task: Task) -> list[str]:
     ]
 
 
+def has_extra_steps(task: Task) -> bool:
+    return any(run.record.extra_steps for runs in task.methods.values() for run in runs)
+
+
 def task_table(task: Task) -> str:
-    rows = [["method", "runs", "steps", "parameters", *COLUMNS]]
+    """Extra steps have a column where any method has some."""
+    with_extra = has_extra_steps(task)
+    rows = [["method", "runs", "steps", *["extra steps"] * with_extra, "parameters", *COLUMNS]]
     for name, (volume, utility, distance) in task.floors.items():
         igd = f"{distance:,.4g}" if np.isfinite(distance) else ""
-        rows.append([f"({name})", "", "", "", f"{volume:,.5g}", f"{utility:,.5g}", "", igd, "", ""])
+        rows.append([f"({name})", "", "", *[""] * with_extra, "", f"{volume:,.5g}", f"{utility:,.5g}", "", igd, "", ""])
     for name, runs in task.methods.items():
         finished = sum(run.is_finished for run in runs)
         steps = max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
@@ -110,7 +118,8 @@ def task_table(task: Task) -> str:
         scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()]
         known = [[score for score in column if np.isfinite(score)] for column in scores]
         estimates = [as_text(estimate(interquartile_mean, [column])) if column else "" for column in known]
-        rows.append([name, f"{finished}/{len(runs)}", f"{steps:,}", f"{parameters:,}", *estimates])
+        extra = [f"{max(run.record.extra_steps for run in runs):,}"] * with_extra
+        rows.append([name, f"{finished}/{len(runs)}", f"{steps:,}", *extra, f"{parameters:,}", *estimates])
     return markdown(rows)
 
 

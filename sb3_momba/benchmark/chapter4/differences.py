@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from sb3_momba.baselines.schedules import script_of
 from sb3_momba.benchmark.chapter4.layout import FIXED, MAIN, Labels, Methods, all_labels
 from sb3_momba.benchmark.chapter4.scores import Tasks, runs_of, settings_of
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
@@ -128,7 +129,7 @@ def differing(record: Record) -> dict[str, tuple[str, str]]:
 
 
 def published_settings(record: Record) -> dict[str, Any]:
-    """Of a record's label, flat; a tuple is a range."""
+    """Of a record's label, flat; a tuple is a range. PGMORL's steps are those of its authors' script for the task."""
     settings: dict[str, Any] = {"n_preferences": protocol.N_PREFERENCES, "n_episodes": protocol.N_EPISODES}
     configuration = "momba" if record.label == FIXED else record.label
     if configuration in shipped_configurations() and "hyperparameters" in record.config:
@@ -142,7 +143,9 @@ def published_settings(record: Record) -> dict[str, Any]:
     found = flat(settings)
     method = STEPS_OF.get(record.label) or next((title for title, labels in MAIN.items() if record.label in labels), None)
     if "steps" not in found and method is not None:
-        found["steps"] = read_thesis().methods[method].steps
+        found["steps"] = float(script_of(record.env).steps) if method == "PGMORL" else read_thesis().methods[method].steps
+    if method == "DPMORL":
+        found["hyperparameters.augment_state"] = False  # The thesis's parameters are those of policies that see no returns.
     return found
 
 

@@ -1,7 +1,8 @@
 """Whose runs stand where in chapter 4: for each table and figure the titles of its cells, and the labels that records of that
 cell may have. A label is the stem of the configuration that was run.
 
-Where several labels are accepted they name one configuration, and the first that has runs on a task counts there.
+Where several labels are accepted they name one configuration, and the first that has runs on a task counts there. DPMORL's
+two are the thesis's, whose policies see no returns, and the paper's.
 """
 
 from sb3_momba.benchmark.results import FIXED_PREFERENCE
@@ -11,6 +12,7 @@ Methods = dict[str, Labels]
 
 MOMBA = ("momba", "value_simba_ce_scalarised", "critic_simba_ce_256")
 PGMORL = ("pgmorl",)
+DPMORL = ("dpmorl_state", "dpmorl")
 
 # Tables 4.2 and 4.3, figures 4.1 and 4.2.
 MAIN: Methods = {
@@ -18,12 +20,12 @@ MAIN: Methods = {
     "PGMORL": PGMORL,
     "GPI-LS": ("gpi_ls",),
     "CAPQL": ("capql",),
-    "DPMORL": ("dpmorl",),
+    "DPMORL": DPMORL,
 }
 
 # Figure 4.3: curves, and methods of which the end alone is shown.
 CURVES: Methods = {"Momba": MOMBA, "CAPQL": ("capql",)}
-LEVELS: Methods = {"PGMORL": PGMORL, "DPMORL": ("dpmorl",)}
+LEVELS: Methods = {"PGMORL": PGMORL, "DPMORL": DPMORL}
 
 # Figure 4.4.
 SAMPLE_EFFICIENCY: Methods = {

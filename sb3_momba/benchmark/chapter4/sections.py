@@ -44,7 +44,10 @@ def file(folder: Path, name: str) -> Path:
 
 
 def table_4_2(tasks: Tasks, folder: Path) -> str:
-    introduction = "Parameters are the mean over the tasks, of a single policy with its critics.\n"
+    introduction = (
+        "Parameters are the mean over the tasks, of a single policy with its critics. Steps behind a + are of episodes that a "
+        "method plays for itself, and in no budget.\n"
+    )
     return "\n".join([introduction, tables.table_4_2(tasks), notes(tasks, layout.MAIN)])
 
 

@@ -14,12 +14,15 @@ from sb3_momba.benchmark.chapter4.scores import (
     aggregate,
     runs_of,
     score_of,
+    settings_of,
 )
 from sb3_momba.benchmark.chapter4.thesis import read_thesis, scaled
 from sb3_momba.benchmark.results import Metric, Run, median_run, parameters_of
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text, markdown
 
+# How many policies PGMORL and DPMORL train at a time.
+N_POLICIES = ("hyperparameters.pop_size", "hyperparameters.n_policies")
 SHORT: dict[Metric, str] = {"hypervolume": "HV", "expected_utility": "EUM"}
 
 
@@ -36,7 +39,7 @@ def table_4_2(tasks: Tasks) -> str:
 
 
 def summary(tasks: Tasks, labels: Labels) -> list[str]:
-    """Policies, parameters and steps of a method's runs."""
+    """Policies, parameters and steps of a method's runs; behind + the steps of episodes that it played for itself."""
     runs = all_runs(tasks, labels)
     if not runs:
         return [MISSING] * 3
@@ -44,18 +47,22 @@ def summary(tasks: Tasks, labels: Labels) -> list[str]:
     parameters = [sum(one.values()) for one in sizes if one]
     policies = [n for n in map(n_policies, runs) if n is not None]
     steps = [steps_of(run) for run in runs]
+    extra = [run.record.extra_steps for run in runs]
+    of_training = range_text((min(steps), max(steps)))
     return [
         range_text((min(policies), max(policies))) if policies else MISSING,
         f"{np.mean(parameters):,.0f}" if parameters else MISSING,
-        range_text((min(steps), max(steps))),
+        f"{of_training} + {range_text((min(extra), max(extra)))}" if any(extra) else of_training,
     ]
 
 
 def n_policies(run: Run) -> int | None:
-    """One of a general policy, as many as solutions of several; unknown of a run that did not finish with several."""
+    """One of a general policy, as many as a method of several trains; unknown of a record that does not say."""
     if run.record.general_policy:
         return 1
-    return None if run.record.final_values is None else len(run.record.final_values)
+    settings = settings_of(run.record)
+    known = [settings[name] for name in N_POLICIES if name in settings]
+    return int(known[0]) if known else None
 
 
 def table_4_3(tasks: Tasks) -> str:
