@@ -21,6 +21,7 @@ from sb3_momba.baselines import runs as baseline_runs
 from sb3_momba.baselines.__main__ import main, parse
 from sb3_momba.baselines.dpmorl import rollout_steps
 from sb3_momba.baselines.judging import CLIP, EPSILON
+from sb3_momba.baselines.returns import UtilityReward
 from sb3_momba.baselines.runs import Baseline, make_baseline, run
 from sb3_momba.baselines.schedules import OF_OTHERS, SCRIPTS, Script, default_steps, iterations, schedule
 from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
@@ -270,6 +271,22 @@ def test_an_evaluation_is_a_rollout_by_hand(tiny) -> None:
         np.testing.assert_allclose(values, by_hand(trained, tiny.settings.algorithm), rtol=1e-5)
 
 
+def test_dpmorl_names_the_policies_that_none_dominates(tmp_path) -> None:
+    made: Any = make_baseline(settings_of("dpmorl", tmp_path), 2)
+    returns = [[[1.0, 2.0]], [[0.0, 1.0]], [[2.0, 1.0]]]
+    fronts = [
+        SimpleNamespace(returns=np.array([r]), discounted_returns=np.array([r]), episode_lengths=np.array([[8]]))
+        for r in returns
+    ]
+    for front in fronts:
+        front.settings = {"deterministic_policy": True}
+    made.finished = [dpmorl.Trained(None, made.low, made.high, played=front) for front in fronts]
+    found = made.evaluate(np.eye(2))
+    made.close()
+    assert found.values.tolist() == [[1, 2], [0, 1], [2, 1]]
+    assert found.settings == {"deterministic_policy": True, "non_dominated": [0, 2]}
+
+
 def test_an_evaluation_of_dpmorl_shows_its_policies_their_returns(tmp_path) -> None:
     made = make_baseline(settings_of("dpmorl", tmp_path), 2)
     made.low, made.high = np.array([-1.0, 0.0]), np.array([3.0, 50.0])
@@ -281,6 +298,36 @@ def test_an_evaluation_of_dpmorl_shows_its_policies_their_returns(tmp_path) -> N
 
     np.testing.assert_allclose(made.evaluate(np.eye(2)).values, [roll_out(act)], rtol=1e-5)
     made.close()
+
+
+def test_each_policy_of_dpmorl_is_trained_for_its_own_utility(tmp_path, monkeypatch) -> None:
+    """The rewards of its episodes add up to f(z_T) - f(0), f its utility over the range of returns that was known."""
+    made: Any = make_baseline(settings_of("dpmorl", tmp_path, steps=512), 2)
+    generated, episodes = [], []
+    generate, step_wait = dpmorl.generate_utilities, UtilityReward.step_wait
+    monkeypatch.setattr(dpmorl, "generate_utilities", lambda *args: generated.extend(generate(*args)) or generated)
+
+    def noting(self: Any) -> Any:
+        observations, rewards, dones, infos = step_wait(self)
+        totals = self.__dict__.setdefault("totals", np.zeros(self.num_envs))
+        totals += rewards
+        for i in dones.nonzero()[0]:
+            episodes.append((len(made.finished), made.low, made.high, infos[i]["accumulated_return"], totals[i]))
+            totals[i] = 0
+        return observations, rewards, dones, infos
+
+    monkeypatch.setattr(UtilityReward, "step_wait", noting)
+    made.train(lambda: None)
+    made.close()
+    assert [index for index, *_ in episodes] == [i for i in range(4) for _ in range(512 // 4 // EPISODE)]
+    for index, low, high, z, total in episodes:
+        width = (high - low).max()
+        lowest = (low + high - width) / 2
+        ends = th.from_numpy(np.stack([z, np.zeros(2)]) - lowest) / width
+        f = 2 * width * generated[index](ends).detach().numpy()
+        assert total == pytest.approx(f[0] - f[1], abs=1e-6)
+    means = [total - z.sum() for index, _, _, z, total in episodes if index > 0]
+    assert max(np.abs(means)) > 0.1  # The others' rewards are not the first one's, the sum of both objectives.
 
 
 def test_the_statistics_of_pgmorl_are_of_all_its_environments(tiny) -> None:
@@ -634,8 +681,17 @@ def test_a_command_trains_and_prints_its_curve(tmp_path, capsys) -> None:
         ("dpmorl", "--set gamma=1.5", "gamma=1.5: it must be from 0 to 1"),
         ("dpmorl", "--set batch_size=1", "batch_size=1: it must be a whole number of at least 2"),
         ("dpmorl", "--set n_steps=2.5", "n_steps=2.5: it must be a whole number"),
+        ("dpmorl", "--set clip_range=-0.2", r"clip_range=-0.2: it must be above 0\.$"),
+        ("dpmorl", "--set gae_lambda=7", "gae_lambda=7: it must be from 0 to 1"),
+        ("dpmorl", "--set learning_rate=0", r"learning_rate=0: it must be above 0\.$"),
+        ("pgmorl", "--set clip_coef=0", "clip_coef=0: it must be above 0"),
+        ("pgmorl", "--set target_kl=-1", "target_kl=-1: it must be above 0"),
+        ("pgmorl", "--set warmup_iterations=2 --set evolutionary_iterations=3", "warmup_iterations=2: .*_iterations=3"),
+        ("gpi_ls", "--set policy_noise=-1", r"policy_noise=-1: it must be at least 0\.$"),
+        ("gpi_ls", "--set alpha=2", "alpha=2: it must be from 0 to 1"),
+        *((algorithm, "--device gpu", "device='gpu' is no device .* give auto, cpu or cuda") for algorithm in ALGORITHMS),
     ],
-    ids=range(29),
+    ids=range(40),
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path, algorithm: str, more: str, message: str, capfd) -> None:
     folder = tmp_path / "run"

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_momba.baselines.dominance import non_dominated_distributions
 from sb3_momba.baselines.returns import AccumulatedReturn, UtilityReward, WithoutReward
-from sb3_momba.baselines.settings import BaselineSettings, completed
+from sb3_momba.baselines.settings import BaselineSettings, completed, device_of
 from sb3_momba.baselines.solutions import SolutionSet, as_set, evaluate_policy
 from sb3_momba.baselines.utilities import UtilityOfReturns, generate_utilities, linear_utilities
 from sb3_momba.envs.registry import raw_id
@@ -160,7 +160,7 @@ class Baseline:
                 n_steps=chosen["n_steps"],
                 policy_kwargs={"net_arch": chosen["net_arch"]},
                 seed=self.settings.seed * chosen["n_policies"] + index,
-                device=self.settings.device,
+                device=device_of(self.settings.device),
                 **{name: chosen[name] for name in OF_PPO},
             )
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 
 from sb3_momba.baselines.library import CountedSteps, hyperparameters_of, imported, quiet_and_seeded
-from sb3_momba.baselines.settings import BaselineSettings, completed
+from sb3_momba.baselines.settings import BaselineSettings, completed, device_of
 from sb3_momba.envs.registry import raw_id
 from sb3_momba.envs.wrappers import make_env
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
@@ -73,8 +73,7 @@ class Baseline:
         self.eval_env = CountedSteps(make_env(raw_id(settings.env)))
         own = {name: value for name, value in self.hyperparameters.items() if name not in OF_TRAIN}
         with quiet_and_seeded(settings.seed):
-            device = "auto" if settings.device == "auto" else th.device(settings.device)
-            self.agent = WithoutLogs(self.env, log=False, seed=settings.seed, device=device, **own)
+            self.agent = WithoutLogs(self.env, log=False, seed=settings.seed, device=device_of(settings.device), **own)
         self.policy = ConditionedPolicy(self.agent.policy, n_objectives, self.agent.gamma, self.agent.device)
         self.parameters = {
             "actor": sum(p.numel() for p in self.agent.policy.parameters()),

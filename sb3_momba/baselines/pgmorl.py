@@ -15,12 +15,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-import torch as th
 
 from sb3_momba.baselines.judging import Judge
 from sb3_momba.baselines.library import CountedSteps, hyperparameters_of, imported, quiet_and_seeded
 from sb3_momba.baselines.schedules import iterations, schedule, script_of
-from sb3_momba.baselines.settings import BaselineSettings, completed
+from sb3_momba.baselines.settings import BaselineSettings, completed, device_of
 from sb3_momba.baselines.solutions import SolutionSet
 from sb3_momba.envs.registry import raw_id
 
@@ -99,7 +98,7 @@ class Baseline:
         own = {name: value for name, value in self.hyperparameters.items() if name != "library_evaluation"}
         env_id = raw_id(settings.env)
         make_one = imported("single_policy.ser.mo_ppo").make_env
-        device = "auto" if settings.device == "auto" else th.device(settings.device)
+        device = device_of(settings.device)
         with quiet_and_seeded(settings.seed):
             try:
                 self.agent = Watched(env_id, np.zeros(n_objectives), log=False, seed=settings.seed, device=device, **own)

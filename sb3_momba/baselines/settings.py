@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch as th
+from stable_baselines3.common.utils import get_device
+
 from sb3_momba.pareto import protocol
 from sb3_momba.settings import RANGES, check_switch, check_whole, is_number
 
@@ -16,6 +19,9 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "dpmorl_state": ("dpmorl", {"augment_state": False}),
 }
 STEPS = {"gpi_ls": 200_000, "dpmorl": 10_000_000}  # Table 4.2; PGMORL's depend on the task, see `schedules.py`
+INTERVALS = {**RANGES, "gae_lambda": (0, 1), "alpha": (0, 1)}  # of numbers that are not whole, ends included
+AT_LEAST_0 = ("policy_noise", "noise_clip", "ent_coef", "vf_coef")
+ABOVE_0 = ("learning_rate", "clip_range", "clip_coef", "max_grad_norm", "target_kl", "min_priority")
 LEAST = {"learning_starts": 0, "batch_size": 2}  # of whole numbers; 1 of others
 
 
@@ -77,5 +83,25 @@ def _check_kind(name: str, value: Any, default: Any) -> None:
             check_whole(name, entry, 1)
     elif not (is_number(value) or (default is None and value is None)):
         raise ValueError(f"{name}={value!r}: give a finite number.")
-    elif name in RANGES and not RANGES[name][0] <= value <= RANGES[name][1]:
-        raise ValueError(f"{name}={value!r}: it must be from {RANGES[name][0]} to {RANGES[name][1]}.")
+    elif value is not None:
+        _check_range(name, value)
+
+
+def _check_range(name: str, value: float) -> None:
+    if name in INTERVALS and not INTERVALS[name][0] <= value <= INTERVALS[name][1]:
+        raise ValueError(f"{name}={value!r}: it must be from {INTERVALS[name][0]} to {INTERVALS[name][1]}.")
+    if name in AT_LEAST_0 and value < 0:
+        raise ValueError(f"{name}={value!r}: it must be at least 0.")
+    if name in ABOVE_0 and value <= 0:
+        raise ValueError(f"{name}={value!r}: it must be above 0.")
+
+
+def device_of(name: str) -> th.device:
+    """As Stable-Baselines3 has it: "auto" is the GPU if there is one, and what asks for one that is not there gets the CPU.
+
+    :raises ValueError: for a name of no device
+    """
+    try:
+        return get_device(name)
+    except RuntimeError as error:
+        raise ValueError(f"device={name!r} is no device of torch ({error}): give auto, cpu or cuda.") from error
