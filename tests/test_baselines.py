@@ -474,6 +474,27 @@ def of_all_tasks(request, tmp_path_factory) -> tuple[str, dict[str, Baseline]]:
         one.close()
 
 
+@pytest.mark.parametrize("task", ["MO-Humanoid-v4", "MO-Hopper-3obj-v4"])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_smallest_run_on_a_task(tmp_path, algorithm: str, task: str) -> None:
+    """Where episodes end early: one where nothing is alike twice, one of three objectives."""
+    small: dict[str, tuple[int, dict[str, Any]]] = {
+        "pgmorl": (5 * 32 * 6, {"num_envs": 1, "steps_per_iteration": 32, "num_minibatches": 4, "net_arch": [8]}),
+        "gpi_ls": (60, {**TINY["gpi_ls"], "timesteps_per_iter": 60, "num_eval_episodes_for_front": 1}),
+        "dpmorl": (4 * 2 * 32, TINY["dpmorl"]),
+    }
+    steps, hyperparameters = small[algorithm]
+    of_three = {"delta_weight": 0.5} if algorithm == "pgmorl" and "3obj" in task else {}
+    settings = settings_of(algorithm, tmp_path / "run", env=task, steps=steps, n_preferences=3, n_episodes=1)
+    settings.hyperparameters = {**hyperparameters, **of_three}
+    run(settings)
+    record = read_record(tmp_path / "run" / "record.jsonl")
+    assert record.error is None
+    assert record.evaluations[-1].steps == steps
+    assert record.extra_steps > 0
+    assert algorithm == "pgmorl" or len(record.final_values) == {"gpi_ls": 3, "dpmorl": 4}[algorithm]
+
+
 def test_networks_are_as_large_as_the_thesis_says(of_all_tasks) -> None:
     """Table 4.2, the average of the tasks; DPMORL's are those of states without the return so far."""
     algorithm, made = of_all_tasks
