@@ -220,7 +220,8 @@ def test_scores_by_hand(fake) -> None:
     np.testing.assert_array_equal(run.curve, [2, 6])
     assert [evaluation.seconds for evaluation in run.record.evaluations] == [1, 2]
     np.testing.assert_array_equal(run.seconds, [1, 2])
-    assert (run.mean_over_steps, run.mean_over_time) == (4, (2 + 4) / 2)
+    # Over time from standing still, 1, on.
+    assert (run.mean_over_steps, run.mean_over_time) == (4, ((1 + 2) / 2 + (2 + 6) / 2) / 2)
 
 
 def test_regret_is_what_the_answer_to_another_preference_would_have_been_worth(fake) -> None:
@@ -609,6 +610,13 @@ def test_curves_by_hand(fake) -> None:
     np.testing.assert_allclose(areas_under_curve(runs), [4, 2, 3, 0])
 
 
+def test_who_evaluates_rarely_gains_nothing_over_time(fake) -> None:
+    """From standing still, 1, both rise by one a second."""
+    made = [fake(box(3.0), {10: box(2.0), 20: box(3.0)}), fake(box(3.0), {20: box(3.0)}, label="b")]
+    often, rarely = (runs[0] for runs in only(compare(made)).methods.values())
+    assert (often.mean_over_time, rarely.mean_over_time) == (2, 2)
+
+
 def test_a_curve_that_stops_short_of_a_common_step_ends_there(fake) -> None:
     """Evaluated last at 25 of 30 steps."""
     runs = curves_of(fake, ({10: 2, 20: 4, 30: 6}, True), ({15: 3, 25: 5}, False))
@@ -696,7 +704,7 @@ def test_a_report_of_two_objectives(fake, tmp_path) -> None:
     assert len(list((tmp_path / "report").glob("*.png"))) == 2
     row = rows_of(text, "b")[0]
     assert row[1:4] == ["2/2", "20", "210"]
-    assert row[4:] == ["6", "2.667", "0", "0", "4", "3"]  # Equal runs have no interval.
+    assert row[4:] == ["6", "2.667", "0", "0", "4", "2.75"]  # Equal runs have no interval.
     assert rows_of(text, "a")[0][1:3] == ["1/3", "20"]
     cells = rows_of(text, "a")[0][4:]
     scores = [1 / 3, (1 + 0.5 + 0.5) / 3, 0, (STILL_DISTANCE + 2 * RANDOM_DISTANCE) / 3]
@@ -726,7 +734,14 @@ def test_fronts_are_drawn_of_two_or_three_objectives(fake, tmp_path, n_objective
 def test_a_report_of_one_evaluation(fake, tmp_path) -> None:
     text = report_of(tmp_path / "report", [fake(FRONT, {10: FRONT}, floors={})])
     assert rows_of(text, "a")[0][1:3] == ["1/1", "10"]
-    assert rows_of(text, "a")[0][4:] == ["6", "2.667", "0", "0", "", "6"]  # A curve of one point has no mean over steps.
+    assert rows_of(text, "a")[0][4:] == [
+        "6",
+        "2.667",
+        "0",
+        "0",
+        "",
+        "3",
+    ]  # One evaluation has no mean over steps, and over time begins at 0.
     assert "improvement" not in text
     assert "## Aggregate" not in text
 
@@ -850,12 +865,12 @@ def test_the_aggregate_by_hand(fake, tmp_path) -> None:
 
 
 def test_curves_in_the_aggregate_by_hand(fake, tmp_path) -> None:
-    """Evaluated after 1 and 2 s, and 1 and 4 s: over the common 2 s, the first second with its end's value."""
+    """Evaluated after 1 and 2 s, and 1 and 4 s: over the common 2 s, from standing still, 1, on."""
     made = [fake(box(4.0), {10: box(2.0), 20: box(4.0)}), fake(box(4.0), {10: box(1.0), 40: box(7.0)}, label="b")]
     text = report_of(tmp_path / "report", made, "a")
-    assert rows_of(text, "a")[0][-2:] == ["3", "2.5"]
+    assert rows_of(text, "a")[0][-2:] == ["3", f"{(1.5 + 3) / 2:g}"]
     assert rows_of(text, "b")[0][-2:] == ["4", f"{(1 + (1 + 3) / 2) / 2:g}"]
-    assert rows_of(text, "b")[-2][-2:] == [f"{4 / 3:.4g}", f"{1.5 / 2.5:.4g}"]
+    assert rows_of(text, "b")[-2][-2:] == [f"{4 / 3:.4g}", f"{1.5 / 2.25:.4g}"]
     assert "up to 2 s" in text
 
 

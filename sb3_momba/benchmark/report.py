@@ -34,7 +34,8 @@ that failed or did not end counts with the hypervolume 0 and with the worst expe
 finished runs; regret is of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all final solutions in
 this report (section 4.4), so it changes with the records; there is none where the envelope is one point. The two columns of
 the curve are mean hypervolumes, areas under it divided by its length: over steps from the first evaluation to the last; over
-time up to the seconds of training (of one processor, without evaluations) that every finished run had.
+time up to the seconds of training (of one processor, without evaluations) that every finished run had, from the better of the
+policies that learned nothing to the first evaluation in a straight line.
 """
 
 

@@ -117,11 +117,13 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
         method: [_score(record, reference, front, earned) for record in its_records]
         for method, its_records in name_methods(records).items()
     }
-    seconds = common_seconds(methods)
+    seconds, start = common_seconds(methods), max((volume for volume, _, _ in floors.values()), default=0.0)
     methods = {
         method: [
             replace(run, mean_over_steps=over_steps, mean_over_time=over_time)
-            for run, over_steps, over_time in zip(runs, areas_under_curve(runs), areas_over_time(runs, seconds), strict=True)
+            for run, over_steps, over_time in zip(
+                runs, areas_under_curve(runs), areas_over_time(runs, seconds, start), strict=True
+            )
         ]
         for method, runs in methods.items()
     }
@@ -261,19 +263,20 @@ def common_seconds(methods: dict[str, list[Run]]) -> float:
     )
 
 
-def areas_over_time(runs: Sequence[Run], seconds: float) -> list[float]:
+def areas_over_time(runs: Sequence[Run], seconds: float, start: float) -> list[float]:
     """For each run its mean hypervolume over its first `seconds` of training; unknown where that is none.
 
-    Before its first evaluation it counts with that; a run that failed has 0 after its last one.
+    A run that failed has 0 after its last evaluation.
+
+    :param start: the hypervolume before training: who evaluates late is not credited with what was learned until then
     """
     if seconds == 0:
         return [np.nan] * len(runs)
     areas = []
     for run in runs:
         times = np.concatenate([[0.0], run.seconds[run.seconds < seconds], [seconds]])
-        curve = (
-            np.interp(times, run.seconds, run.curve, right=None if run.is_finished else 0.0) if len(run.seconds) else 0 * times
-        )
+        known = np.append(0.0, run.seconds), np.append(start, run.curve)
+        curve = np.interp(times, *known, right=None if run.is_finished else 0.0) if len(run.seconds) else 0 * times
         areas.append(float(trapezoid(curve, times) / seconds))
     return areas
 
