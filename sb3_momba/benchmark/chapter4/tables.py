@@ -14,7 +14,6 @@ from sb3_momba.benchmark.chapter4.scores import (
     aggregate,
     runs_of,
     score_of,
-    settings_of,
 )
 from sb3_momba.benchmark.chapter4.thesis import read_thesis, scaled
 from sb3_momba.benchmark.results import Metric, Run, median_run, parameters_of
@@ -22,7 +21,7 @@ from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text, markdown
 
 # How many policies PGMORL and DPMORL train at a time.
-N_POLICIES = ("hyperparameters.pop_size", "hyperparameters.n_policies")
+N_POLICIES = ("pop_size", "n_policies")
 SHORT: dict[Metric, str] = {"hypervolume": "HV", "expected_utility": "EUM"}
 
 
@@ -60,9 +59,8 @@ def n_policies(run: Run) -> int | None:
     """One of a general policy, as many as a method of several trains; unknown of a record that does not say."""
     if run.record.general_policy:
         return 1
-    settings = settings_of(run.record)
-    known = [settings[name] for name in N_POLICIES if name in settings]
-    return int(known[0]) if known else None
+    hyperparameters = run.record.config.get("hyperparameters", {})
+    return next((int(hyperparameters[name]) for name in N_POLICIES if name in hyperparameters), None)
 
 
 def table_4_3(tasks: Tasks) -> str:
