@@ -13,7 +13,7 @@ from sb3_momba.benchmark.results import Run, Task, compare, curve_on, median_run
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
-from sb3_momba.pareto.plotting import COLOURS, plot_front, verbatim
+from sb3_momba.pareto.plotting import COLOURS, default_style, plot_front, verbatim
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
 
 CURVE_REPETITIONS = 2_000
@@ -62,10 +62,11 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
         if task.fixed_preference:
             finished = f"{sum(record.error is None for record in task.fixed_preference)}/{len(task.fixed_preference)}"
             parts.append(f"Not in the table: runs of a fixed preference each, {finished}, points of one front.\n")
-        if draw_curves(task, folder / f"curve-{name}.png"):
-            parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
-        if draw_fronts(task, folder / f"front-{name}.png"):
-            parts.append(f"![Fronts of the seeds of median hypervolume](front-{name}.png)\n")
+        with default_style():
+            if draw_curves(task, folder / f"curve-{name}.png"):
+                parts.append(f"![Hypervolume over environment steps](curve-{name}.png)\n")
+            if draw_fronts(task, folder / f"front-{name}.png"):
+                parts.append(f"![Fronts of the seeds of median hypervolume](front-{name}.png)\n")
     parts += [aggregate, comparison_table(tasks), failures(tasks), provenance(records)]
     text = "\n".join(part for part in parts if part)
     with atomic_write(folder / "report.md") as file:

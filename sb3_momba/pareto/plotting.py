@@ -1,5 +1,6 @@
 """Pictures of Pareto fronts."""
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -61,6 +62,13 @@ def plot_front(
         with atomic_write(path) as file:
             figure.savefig(file, dpi=150, format=os.path.splitext(path)[1].lstrip(".") or "png")
     return figure
+
+
+def default_style() -> contextlib.AbstractContextManager[None]:
+    """Inside, no matplotlibrc, and nothing that another library has set, changes the pictures."""
+    import matplotlib.style
+
+    return matplotlib.style.context("default")
 
 
 def verbatim(text: str) -> str:

@@ -1,11 +1,9 @@
 """The figures of chapter 4: numbers in, a PNG out. Each says whether there was anything to draw."""
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from sb3_momba.benchmark.chapter4.scores import Aggregate, Curve
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.files import atomic_write
-from sb3_momba.pareto.plotting import COLOURS, MARKERS, label_axes, scatter_front, verbatim
+from sb3_momba.pareto.plotting import COLOURS, MARKERS, default_style, label_axes, scatter_front, verbatim
 
 Array = NDArray[np.float64]
 STYLES = ("-", "--", ":", "-.")
@@ -191,11 +189,6 @@ def layout(n: int) -> tuple[int, int]:
     """Columns and rows of n panels: at most four side by side."""
     columns = min(n, 4)
     return columns, -(-n // columns)
-
-
-def default_style() -> contextlib.AbstractContextManager[None]:
-    """A matplotlibrc of the user's or of the working directory would change the pictures."""
-    return matplotlib.style.context("default")
 
 
 def write(figure: Figure, path: Path, has_legend: bool = True) -> None:
