@@ -91,14 +91,15 @@ def make_batch(rewards: Any, preferences: Any, dones: Any = None, discounts: Any
     )
 
 
-class StubCritic:
+class StubCritic(th.nn.Module):
     """Stands for a critic ensemble: `outputs(observations, actions)` is (batch, n_critics, n_values, n_outputs), whatever is
     beside them."""
 
     def __init__(self, outputs: Callable[[th.Tensor, th.Tensor], th.Tensor]):
+        super().__init__()
         self.outputs = outputs
 
-    def __call__(self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor) -> th.Tensor:
+    def forward(self, observations: th.Tensor, actions: th.Tensor, *beside: th.Tensor) -> th.Tensor:
         return self.outputs(observations, actions)
 
     def values_and_features(
