@@ -24,10 +24,7 @@ from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.nn.speed import without_weight_gradients
 from sb3_momba.policies import SHIPPED_POLICIES
 from sb3_momba.policy import MombaPolicy
-from sb3_momba.settings import (
-    check_other_arguments,
-    parameters,
-)
+from sb3_momba.settings import check_other_arguments, parameters
 
 MAX_SKIPPED_UPDATES = 20
 
