@@ -6,7 +6,8 @@ import sb3_momba.envs.registry  # noqa: F401  registers the tasks of the thesis,
 from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.envs.checking import check_mo_env
-from sb3_momba.envs.wrappers import PreferenceWrapper, make_mo_vec_env
+from sb3_momba.envs.making import make_mo_vec_env
+from sb3_momba.envs.wrappers import PreferenceWrapper
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto.callbacks import ParetoEvalCallback
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front

@@ -22,18 +22,10 @@ from sb3_momba.checkpoints.checkpoint import resume
 from sb3_momba.checkpoints.folders import Checkpoint
 from sb3_momba.checkpoints.training_state import callbacks_below, given_callback, set_states_of_callbacks
 from sb3_momba.diagnostics import NegativeReturnWatch, TrainingMetrics, weight_norm
-from sb3_momba.envs.preferences import (
-    FixedSampler,
-    PreferenceSampler,
-    SamplerSpec,
-    check_preference,
-    make_sampler,
-    preference_dim,
-)
-from sb3_momba.envs.wrappers import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.envs.making import check_vec_env, make_env, n_objectives_of, wrap_env
+from sb3_momba.envs.preferences import FixedSampler, PreferenceSampler, SamplerSpec, make_sampler
 from sb3_momba.exploration import HeldNoise
 from sb3_momba.export import export_policy
-from sb3_momba.finite import all_finite
 from sb3_momba.logs import forgive_full_disks
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.speed import keep_freed_memory
@@ -213,7 +205,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         :return: (action_dim,) or (batch, action_dim), and `state`
         :raises ValueError: if one of both is missing, doubled or of the wrong shape
         """
-        return self.policy.predict(self._with_preference(observation, preference), state, episode_start, deterministic)
+        sampler = None if self.preference_sampler is None else make_sampler(self.preference_sampler, self.n_objectives)
+        kept = sampler.preference if isinstance(sampler, FixedSampler) else None
+        wrapped = self.policy.with_preference(observation, preference, kept)
+        return self.policy.predict(wrapped, state, episode_start, deterministic)
 
     def export(self, path: str | os.PathLike[str], preference: Sequence[float] | np.ndarray | None = None) -> None:
         """Write the deterministic policy as a graph that runs without this package; the old file stands until the new one is
@@ -229,37 +224,6 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         :raises ImportError: if onnx is missing
         """
         export_policy(self.policy, path, preference)
-
-    def _with_preference(self, observation: np.ndarray, preference: Sequence[float] | np.ndarray | None) -> np.ndarray:
-        if isinstance(observation, (tuple, dict)):
-            return observation  # the policy's own error
-        observation = np.asarray(observation)
-        if not all_finite(observation):
-            raise ValueError(f"The observation {observation} has a number that is not finite: no action answers it.")
-        raw, wrapped = self.policy.observation_dim, self.policy.observation_dim + preference_dim(self.n_objectives)
-        width = observation.shape[-1] if observation.ndim > 0 else 0
-        if preference is None:
-            if width != raw or raw == wrapped:
-                return observation
-            sampler = None if self.preference_sampler is None else make_sampler(self.preference_sampler, self.n_objectives)
-            if not isinstance(sampler, FixedSampler):
-                raise ValueError(
-                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights; "
-                    "for EvalCallback and evaluate_policy, make the environment by make_mo_vec_env."
-                )
-            preference = sampler.preference
-        w = check_preference(preference, self.n_objectives)
-        if wrapped == raw:
-            return observation
-        if width != raw:
-            raise ValueError(
-                f"With preference=, the observation must be the environment's own, {raw} wide, not {width}"
-                + (", which carries a preference already." if width == wrapped else ".")
-            )
-        if observation.ndim < w.ndim or (w.ndim == 2 and len(w) != len(observation)):
-            raise ValueError(f"Observations of shape {observation.shape} and preferences of shape {w.shape} do not match.")
-        w = np.broadcast_to(w, (*observation.shape[:-1], self.n_objectives))
-        return np.concatenate([observation, w], axis=-1, dtype=np.float32)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

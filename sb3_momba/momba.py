@@ -14,8 +14,8 @@ from stable_baselines3.common.utils import update_learning_rate
 from sb3_momba.algorithm import PreferenceConditionedAlgorithm
 from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamples
 from sb3_momba.diagnostics import Metrics
+from sb3_momba.envs.making import n_objectives_of
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
-from sb3_momba.envs.wrappers import n_objectives_of
 from sb3_momba.nn.batch_norm import follow_batch_statistics, without_batch_statistics
 from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest

@@ -1,6 +1,6 @@
 """MombaPolicy: actor, critic ensemble, target critics and running statistics in one module."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any, TypeVar
 
@@ -11,8 +11,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import get_device
 
-from sb3_momba.envs.preferences import preference_dim
+from sb3_momba.envs.preferences import check_preference, preference_dim
 from sb3_momba.files import FileFormatError, FilePath, content_of, write_tree
+from sb3_momba.finite import all_finite
 from sb3_momba.formats import header, read_format
 from sb3_momba.nn.layers import project_weights
 from sb3_momba.nn.networks import Actor, Architecture, Critic
@@ -145,6 +146,48 @@ class MombaPolicy(BasePolicy):
         self.set_training_mode(False)
         mean, log_std = self.actor.distribution(self.normalize(th.as_tensor(observation, device=self.device)))
         return th.tanh(mean + log_std.exp() * noise(mean)).cpu().numpy()
+
+    def with_preference(
+        self,
+        observation: np.ndarray,
+        preference: Sequence[float] | np.ndarray | None,
+        kept: Sequence[float] | np.ndarray | None = None,
+    ) -> np.ndarray:
+        """[s, w], as `predict` takes it, (..., observation_dim + preference_dim).
+
+        :param observation: s with `preference`, or [s, w] without
+        :param preference: (n_objectives,) or (batch, n_objectives)
+        :param kept: the preference of an s that comes without one
+        :raises ValueError: if one of both is missing, doubled or of the wrong shape
+        """
+        if isinstance(observation, (tuple, dict)):
+            return observation  # SB3's own error
+        observation = np.asarray(observation)
+        if not all_finite(observation):
+            raise ValueError(f"The observation {observation} has a number that is not finite: no action answers it.")
+        raw, wrapped = self.observation_dim, self.observation_dim + self.preference_dim
+        width = observation.shape[-1] if observation.ndim > 0 else 0
+        if preference is None:
+            if width != raw or raw == wrapped:
+                return observation
+            if kept is None:
+                raise ValueError(
+                    f"This observation has no preference: call predict(..., preference=w) with {self.n_objectives} weights; "
+                    "for EvalCallback and evaluate_policy, make the environment by make_mo_vec_env."
+                )
+            preference = kept
+        w = check_preference(preference, self.n_objectives)
+        if wrapped == raw:
+            return observation
+        if width != raw:
+            raise ValueError(
+                f"With preference=, the observation must be the environment's own, {raw} wide, not {width}"
+                + (", which carries a preference already." if width == wrapped else ".")
+            )
+        if observation.ndim < w.ndim or (w.ndim == 2 and len(w) != len(observation)):
+            raise ValueError(f"Observations of shape {observation.shape} and preferences of shape {w.shape} do not match.")
+        w = np.broadcast_to(w, (*observation.shape[:-1], self.n_objectives))
+        return np.concatenate([observation, w], axis=-1, dtype=np.float32)
 
     def set_training_mode(self, mode: bool) -> None:
         """SB3's, which acting and learning call in turn at every step; nn.Module's own way takes half as long as acting."""

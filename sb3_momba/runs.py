@@ -19,8 +19,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_momba.checkpoints.callback import MombaCheckpointCallback
 from sb3_momba.checkpoints.folders import checkpoints_in
+from sb3_momba.envs.making import make_env, make_mo_vec_env, n_objectives_of
 from sb3_momba.envs.preferences import check_preference, preference_grid
-from sb3_momba.envs.wrappers import make_env, make_mo_vec_env, n_objectives_of
 from sb3_momba.files import LOCK, alone_in
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto import protocol

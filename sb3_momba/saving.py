@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 from stable_baselines3.common.utils import get_system_info
 
 from sb3_momba.buffers import STORED_ARRAYS, PreferenceReplayBuffer
-from sb3_momba.envs.wrappers import n_objectives_of
+from sb3_momba.envs.making import n_objectives_of
 from sb3_momba.files import (
     WRONG_CONTENT,
     FileFormatError,

@@ -20,8 +20,8 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 from sb3_momba import MOMBA, PreferenceReplayBuffer
 from sb3_momba.buffers import PreferenceReplayBufferSamples
+from sb3_momba.envs.making import wrap_env
 from sb3_momba.envs.preferences import FixedSampler
-from sb3_momba.envs.wrappers import wrap_env
 from sb3_momba.nn.distributional import cross_entropy, expectation, make_support, project
 from sb3_momba.nn.normalization import ReturnScale, RunningStatistics
 

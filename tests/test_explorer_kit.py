@@ -12,7 +12,7 @@ import onnxruntime
 import pytest
 
 from sb3_momba import MOMBA
-from sb3_momba.envs.wrappers import make_env
+from sb3_momba.envs.making import make_env
 from sb3_momba.explorer.kit import DecisionKit
 from sb3_momba.explorer.opening import open_kit, write_calibration
 from sb3_momba.explorer.prediction import CRITIC, FRONT, predictors_of, share_close, sizes

@@ -42,8 +42,8 @@ from sb3_momba import (
     plot_front,
     preference_regret,
 )
+from sb3_momba.envs.making import wrap_env
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, preference_grid
-from sb3_momba.envs.wrappers import wrap_env
 from sb3_momba.files import FileFormatError, write_tree
 from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy
 from sb3_momba.pareto.metrics import non_dominated

@@ -14,9 +14,10 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common import env_checker as sb3_env_checker
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+from sb3_momba.envs.making import make_mo_vec_env
 from sb3_momba.envs.pgmorl import TASKS, register
 from sb3_momba.envs.pgmorl_physics import sums_margins
-from sb3_momba.envs.wrappers import PreferenceWrapper, make_mo_vec_env
+from sb3_momba.envs.wrappers import PreferenceWrapper
 
 IDS = sorted(TASKS)
 BOTH = pytest.mark.parametrize("physics", ["2020", "current"])

@@ -25,8 +25,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, records, system
+from sb3_momba.envs.making import make_mo_vec_env
 from sb3_momba.envs.preferences import ConeSampler, preference_grid
-from sb3_momba.envs.wrappers import make_mo_vec_env
 from sb3_momba.files import FileFormatError
 from sb3_momba.pareto import callbacks
 from sb3_momba.pareto.callbacks import RecordCallback

@@ -23,8 +23,8 @@ from sb3_momba.baselines.returns import AccumulatedReturn, UtilityReward, Withou
 from sb3_momba.baselines.settings import BaselineSettings, completed, device_of
 from sb3_momba.baselines.solutions import SolutionSet, as_set, evaluate_policy
 from sb3_momba.baselines.utilities import UtilityOfReturns, generate_utilities, linear_utilities
+from sb3_momba.envs.making import make_env
 from sb3_momba.envs.registry import raw_id
-from sb3_momba.envs.wrappers import make_env
 from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.floors import RandomPolicy
 from sb3_momba.settings import check_whole

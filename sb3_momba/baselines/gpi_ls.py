@@ -13,8 +13,8 @@ import torch as th
 
 from sb3_momba.baselines.library import CountedSteps, hyperparameters_of, imported, quiet_and_seeded
 from sb3_momba.baselines.settings import BaselineSettings, completed, device_of
+from sb3_momba.envs.making import make_env
 from sb3_momba.envs.registry import raw_id
-from sb3_momba.envs.wrappers import make_env
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
 
 OF_TRAIN = {"timesteps_per_iter": 10_000, "num_eval_episodes_for_front": 5}

@@ -18,7 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_momba.benchmark.report import describe
 from sb3_momba.benchmark.tables import markdown
-from sb3_momba.envs.wrappers import make_mo_vec_env
+from sb3_momba.envs.making import make_mo_vec_env
 from sb3_momba.momba import MOMBA
 from sb3_momba.nn.products import fast_float32_products
 from sb3_momba.nn.speed import has_compiler

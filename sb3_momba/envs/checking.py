@@ -10,7 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.env_util import is_wrapped
 
-from sb3_momba.envs.wrappers import EnvLike, PreferenceWrapper, declared_reward_space, make_env
+from sb3_momba.envs.making import EnvLike, make_env
+from sb3_momba.envs.spaces import declared_reward_space
+from sb3_momba.envs.wrappers import PreferenceWrapper
 
 LARGEST_RATIO = 1e3  # of the objectives' sizes
 OURS = ("vector_reward", "preference")  # what PreferenceWrapper adds to a step's info

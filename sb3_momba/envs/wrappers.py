@@ -1,30 +1,21 @@
-"""The wrapper that conditions observations on a preference, and vectorised environments that carry it."""
+"""The wrapper that conditions observations on a preference."""
 
-import contextlib
-import logging
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
-import mo_gymnasium  # noqa: F401  registers its environments' ids
 import numpy as np
 from gymnasium import spaces
-from mo_gymnasium.wrappers.wrappers import LinearReward
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import CloudpickleWrapper
 
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec, check_preference, make_sampler, preference_dim
-from sb3_momba.envs.workers import WatchedSubprocVecEnv
+from sb3_momba.envs.spaces import HOW_TO_DECLARE, check_spaces, count_objectives, declared_reward_space
 from sb3_momba.finite import all_finite
 
 LARGEST_REWARD = 1e10
 LONGEST_REPLAY = 20_000  # actions of an episode that are noted
-
-EnvLike = str | gym.Env | Callable[[], gym.Env]
-
-logger = logging.getLogger(__name__)
 
 
 class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs):
@@ -257,169 +248,3 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def _where(self) -> str:
         name = self.spec.id if self.spec is not None else type(self.unwrapped).__name__
         return f"{name} (environment {self.env_index}, step {self._episode_step} of the episode)"
-
-
-HOW_TO_DECLARE = (
-    "if it has several objectives, declare them in the environment's __init__: "
-    "self.reward_space = gymnasium.spaces.Box(-inf, inf, shape=(n_objectives,)), as MO-Gymnasium does"
-)
-
-
-def declared_reward_space(env: gym.Env) -> spaces.Box | None:
-    """The environment's `reward_space`, wherever in its stack of wrappers it stands, or None."""
-    if is_wrapped(env, LinearReward):
-        return None  # MO-Gymnasium's own scalarisation, behind which the reward space still shows
-    space = env.get_wrapper_attr("reward_space") if env.has_wrapper_attr("reward_space") else None
-    if space is not None and (not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1):
-        raise ValueError(f"reward_space={space!r} is not a one-dimensional Box with an entry per objective.")
-    return space
-
-
-def count_objectives(env: gym.Env) -> int:
-    """n_objectives of the declared `reward_space`, or 1."""
-    space = declared_reward_space(env)
-    return 1 if space is None else int(space.shape[0])
-
-
-class UnsupportedSpaceError(ValueError, AssertionError):
-    """Observations or actions that the policy does not know; SB3 raises AssertionError where it does not know a space."""
-
-
-def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-    """
-    :raises UnsupportedSpaceError: where observations are not a one-dimensional Box, or actions not a bounded Box
-    """
-    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-        raise UnsupportedSpaceError(
-            f"The observation space {observation_space} is not a one-dimensional Box: flatten it with "
-            "gymnasium.wrappers.FlattenObservation, images after a feature extractor of your own."
-        )
-    if not isinstance(action_space, spaces.Box):
-        raise UnsupportedSpaceError(f"The action space {action_space} is not supported: MOMBA needs continuous actions, a Box.")
-    if len(action_space.shape) != 1 or action_space.shape[0] == 0:
-        raise UnsupportedSpaceError(
-            f"The action space {action_space} has shape {action_space.shape}: flatten it to (n,) with an ActionWrapper."
-        )
-    low, high = action_space.low, action_space.high
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise UnsupportedSpaceError(
-            f"The action space {action_space} has no finite bounds: MOMBA's policy covers [low, high]. Ask the environment for "
-            "bounded actions (water-reservoir-v0: normalized_action=True) or put an ActionWrapper with a bounded Box around it."
-        )
-    if (low >= high).any():
-        raise UnsupportedSpaceError(
-            f"The action space {action_space} has low >= high in dimension {int((low >= high).argmax())}: leave a constant "
-            "action out of the space with an ActionWrapper."
-        )
-
-
-def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode: str | None = None) -> gym.Env:
-    """An environment from its id, from a callable, or itself. Ids are made without Gymnasium's checker, which does not
-    know vector rewards.
-
-    :param render_mode: for an id, where its environment takes one
-    """
-    if isinstance(env, str):
-        if render_mode is not None:
-            with contextlib.suppress(TypeError), warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "(?s).*render_mode", UserWarning)  # It need not have this one.
-                return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
-        try:
-            return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
-        except TypeError as error:
-            if not env_kwargs:
-                raise
-            raise ValueError(f"{env} cannot be made with env_kwargs={env_kwargs}: {str(error).rstrip('.')}.") from error
-    if isinstance(env, gym.Env):
-        if env_kwargs:
-            raise ValueError("env_kwargs go with an id or a callable; this environment exists already.")
-        return env
-    return env(**(env_kwargs or {}))
-
-
-def wrap_env(env: gym.Env, preference_sampler: PreferenceSampler | SamplerSpec | None = None) -> Monitor:
-    """`Monitor(PreferenceWrapper(env))`, unless both are there already."""
-    has_monitor, has_preference = is_wrapped(env, Monitor), is_wrapped(env, PreferenceWrapper)
-    if has_preference and preference_sampler is not None:
-        env.get_wrapper_attr("set_preference_sampler")(preference_sampler)
-    if not has_preference:
-        env = PreferenceWrapper(env, preference_sampler)
-    return env if has_monitor else Monitor(env)  # type: ignore[return-value]
-
-
-def make_mo_vec_env(
-    env: str | Callable[[], gym.Env],
-    n_envs: int = 1,
-    seed: int | None = None,
-    preference_sampler: PreferenceSampler | SamplerSpec | None = None,
-    env_kwargs: dict[str, Any] | None = None,
-    vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
-    vec_env_kwargs: dict[str, Any] | None = None,
-) -> VecEnv:
-    """Several copies of a vector-reward environment, each `Monitor(PreferenceWrapper(env))`.
-
-    SB3's `make_vec_env(wrapper_class=...)` would put the wrapper outside Monitor, where vector rewards cannot pass.
-
-    Observations are [s, w], float32 (n_envs, observation_dim + preference_dim); rewards w . r, (n_envs,), each r in its
-    environment's info as `vector_reward`, (n_objectives,).
-
-    :param env: id or callable that makes a new environment
-    :param n_envs: copies, at least one
-    :param seed: environment i starts with seed + i
-    :param preference_sampler: for every copy; each has its own random stream
-    :param env_kwargs: of the id or the callable
-    :param vec_env_cls: with SubprocVecEnv, processes are watched over: see WatchedSubprocVecEnv
-    :param vec_env_kwargs: of its constructor
-    :raises ValueError: for an environment that exists already, n_envs below 1, or what PreferenceWrapper refuses
-    :raises WorkerError: with SubprocVecEnv, where a process raises an error or dies
-    """
-    if isinstance(env, gym.Env):
-        raise ValueError("make_mo_vec_env needs an id or a callable that makes new environments, not one environment.")
-
-    if n_envs < 1:
-        raise ValueError(f"n_envs={n_envs}: at least one environment is needed.")
-
-    def maker(index: int) -> Callable[[], gym.Env]:
-        def make() -> gym.Env:
-            wrapped = wrap_env(make_env(env, env_kwargs), preference_sampler)
-            wrapped.get_wrapper_attr("set_env_index")(index)
-            return wrapped
-
-        return make
-
-    vec_env_cls = WatchedSubprocVecEnv if vec_env_cls is SubprocVecEnv else vec_env_cls
-    venv = vec_env_cls([maker(i) for i in range(n_envs)], **(vec_env_kwargs or {}))
-    if seed is not None:
-        venv.seed(seed)
-    return venv
-
-
-def check_vec_env(venv: VecEnv) -> None:
-    """A VecEnv that MOMBA can train on: every environment in a PreferenceWrapper, or every one scalar.
-
-    :raises ValueError: naming what is missing or differs
-    """
-    check_spaces(venv.observation_space, venv.action_space)
-    wrapped = venv.env_is_wrapped(PreferenceWrapper)
-    if all(wrapped):
-        for index in range(venv.num_envs):
-            venv.env_method("set_env_index", index, indices=[index])
-        n_objectives = venv.get_attr("n_objectives")
-        if len(set(n_objectives)) > 1:
-            raise ValueError(f"The environments of this VecEnv differ in their numbers of objectives: {n_objectives}.")
-        inside = venv.get_attr("raw_shape")[0][0] + preference_dim(n_objectives[0])
-        if venv.observation_space.shape != (inside,):
-            raise ValueError(
-                f"A wrapper outside PreferenceWrapper changes [observation, preference] from ({inside},) to "
-                f"{venv.observation_space.shape}: put it inside, as in Monitor(PreferenceWrapper(YourWrapper(env)))."
-            )
-    elif any(wrapped) or venv.has_attr("reward_space"):
-        raise ValueError(
-            "This VecEnv has vector rewards without PreferenceWrapper: vector rewards do not pass through a VecEnv. Build it "
-            "with sb3_momba.make_mo_vec_env, or give MOMBA the environment's id."
-        )
-
-
-def n_objectives_of(venv: VecEnv) -> int:
-    """The number of objectives of a checked VecEnv; 1 where its environments are scalar."""
-    return int(venv.get_attr("n_objectives", indices=[0])[0]) if all(venv.env_is_wrapped(PreferenceWrapper)) else 1

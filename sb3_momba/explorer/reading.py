@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_momba.envs.wrappers import make_env
+from sb3_momba.envs.making import make_env
 from sb3_momba.explorer.rendering import Film, Policy
 from sb3_momba.files import FileFormatError
 from sb3_momba.pareto.evaluation import ParetoFront

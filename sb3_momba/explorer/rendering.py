@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_momba import MOMBA
-from sb3_momba.envs.wrappers import make_env
+from sb3_momba.envs.making import make_env
 from sb3_momba.explorer.stage import Camera, Image, RenderingError, Stage, backends, camera_on, follow
 from sb3_momba.pareto.evaluation import check_model_fits, probe_environment, run_jobs
 

@@ -9,7 +9,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_momba import MOMBA
-from sb3_momba.envs.wrappers import make_env
+from sb3_momba.envs.making import make_env
 from sb3_momba.explorer.rendering import Policy, Recorder, load_model
 from sb3_momba.pareto.evaluation import MAX_PARALLEL_EPISODES, ParetoFront, probe_environment, run_jobs
 

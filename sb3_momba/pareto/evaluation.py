@@ -13,9 +13,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
 
+from sb3_momba.envs.making import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.registry import raw_id
-from sb3_momba.envs.wrappers import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.files import FileFormatError, FilePath, read_tree, with_existing_suffix, with_suffix, write_tree
 from sb3_momba.pareto import metrics
 from sb3_momba.pareto.processes import in_processes

@@ -7,8 +7,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import CloudpickleWrapper, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_momba.envs.making import n_objectives_of
 from sb3_momba.envs.preferences import check_preference, make_sampler
-from sb3_momba.envs.wrappers import n_objectives_of
 
 
 class PrintReturns(VecEnvWrapper):

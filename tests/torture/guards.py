@@ -19,6 +19,7 @@ from sb3_momba.buffers import PreferenceReplayBuffer
 from sb3_momba.envs.workers import WatchedSubprocVecEnv
 from sb3_momba.logs import ForgivingWrite
 from sb3_momba.nn import descent
+from sb3_momba.policy import MombaPolicy
 from sb3_momba.zoo.configuration import read_configuration
 from tests.stubs import StubEnv
 from tests.torture.measured import Counts, Measured, Rows
@@ -72,7 +73,7 @@ def add(
     buffer.n_added += 1
 
 
-def take_observation(model: MOMBA, observation: np.ndarray, preference: Any) -> np.ndarray:
+def take_observation(policy: MombaPolicy, observation: np.ndarray, preference: Any, kept: Any) -> np.ndarray:
     return observation
 
 
@@ -85,7 +86,7 @@ GUARDS = [
     Guard("rewards", PreferenceWrapper, "_check_reward", take_reward),
     Guard("preferences", PreferenceWrapper, "_one_preference", take_preference),
     Guard("replay buffer", PreferenceReplayBuffer, "add", add),
-    Guard("predict", MOMBA, "_with_preference", take_observation),
+    Guard("predict", MombaPolicy, "with_preference", take_observation),
     Guard("losses", descent, "check_loss", pass_by),
     Guard("gradients", descent, "check_gradients", pass_by),
     # Once in several episodes: no step of those that are measured has a call of it.
@@ -140,7 +141,7 @@ def watching_costs(steps: int) -> tuple[float, float]:
     """Seconds of processor time of a step of two idle environments in processes of their own: ours, and SB3's."""
     seconds = []
     for cls in (WatchedSubprocVecEnv, SubprocVecEnv):
-        with mock.patch("sb3_momba.envs.wrappers.WatchedSubprocVecEnv", cls):
+        with mock.patch("sb3_momba.envs.making.WatchedSubprocVecEnv", cls):
             venv = make_mo_vec_env(StubEnv, 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
         assert type(venv) is cls
         venv.reset()

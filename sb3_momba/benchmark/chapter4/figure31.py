@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_momba.benchmark.chapter4.figures import write
 from sb3_momba.benchmark.tables import markdown
+from sb3_momba.envs.making import make_env, wrap_env
 from sb3_momba.envs.preferences import preference_grid
-from sb3_momba.envs.wrappers import make_env, wrap_env
 from sb3_momba.momba import MOMBA
 from sb3_momba.nn.values import DistributionalValue
 from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front
