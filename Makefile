@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence reduced rounding sweep-throughput speed torture compat docs linkcheck clean
+.PHONY: demo test browser lint known-fronts first-records evidence comparison reduced rounding sweep-throughput speed torture compat docs linkcheck clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -43,6 +43,24 @@ evidence: $(VENV)/installed
 	$(BIN)/python -m sb3_momba.benchmark run --conf momba her_par $(EVIDENCE) --auto-ent-coef 0.01 \
 		--set precision=auto --set compile=true --output runs/evidence/momba
 	$(BIN)/python -m sb3_momba.benchmark report runs/evidence
+
+# The baselines beside it at the same number of steps (two hours of one core), and PGMORL and DPMORL at 1,000,000 (three hours).
+EQUAL := --env MO-HalfCheetah-v4 MO-Walker2d-v4 MO-Hopper-v4 --seeds 3
+OWN := --env MO-HalfCheetah-v4 --seeds 3
+
+comparison: $(VENV)/tools
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf pgmorl $(EQUAL) --steps 49920 --eval-freq 9984 \
+		--set steps_per_iteration=1664 --set num_envs=1 --output runs/comparison/pgmorl
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf dpmorl dpmorl_state $(EQUAL) --steps 5e4 --eval-freq 1e4 \
+		--output runs/comparison/dpmorl
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf gpi_ls_utd_1 --env MO-HalfCheetah-v4 MO-Walker2d-v4 --seeds 3 \
+		--steps 5e4 --eval-freq 1e4 --output runs/comparison/gpi_ls
+	$(BIN)/python -m sb3_momba.benchmark report runs/evidence runs/comparison --output runs/comparison
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf pgmorl $(OWN) --steps 983040 --eval-freq 98304 \
+		--label "pgmorl, 1M" --output runs/million/pgmorl
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf dpmorl $(OWN) --steps 1e6 --eval-freq 1e5 \
+		--label "dpmorl, 1M" --output runs/million/dpmorl
+	$(BIN)/python -m sb3_momba.benchmark report runs/million
 
 # The ablations of chapter 4 in short, on one task: about twelve hours of one core.
 reduced: $(VENV)/installed
