@@ -56,6 +56,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     target_entropy: str | float
     deterministic_exploration: bool
     noise_repeat: int
+    td3_noise: float | None
     compile: bool
     log_ent_coef: th.Tensor | None
     _root_callback: BaseCallback | None = None
@@ -228,14 +229,17 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's or noise that is
-        kept is asked for."""
-        if self.num_timesteps < learning_starts or not (self.deterministic_exploration or self.noise_repeat > 1):
+        """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's, TD3's or noise
+        that is kept is asked for."""
+        explores_by_the_mean = self.deterministic_exploration or self.td3_noise is not None
+        if self.num_timesteps < learning_starts or not (explores_by_the_mean or self.noise_repeat > 1):
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, np.ndarray)
-        if self.deterministic_exploration:
+        if explores_by_the_mean:
             action, _ = self.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
+            if self.td3_noise is not None:
+                scaled = np.clip(scaled + self.td3_noise * self._held_noise(th.zeros(scaled.shape)).numpy(), -1, 1)
         else:
             scaled = self.policy.explore(self._last_obs, self._held_noise)
         if action_noise is not None:

@@ -63,6 +63,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param ent_coef_learning_rate: of the entropy coefficient alone; None: `learning_rate`
     :param policy_delay: updates of the critics for each of the actor and the entropy coefficient (TD3, Fujimoto et al., 2018)
     :param noise_repeat: most steps for which the noise of one sampled action is kept (FlashSAC); 1: new noise at every step
+    :param td3_noise: None: SAC's stochastic policy. A number: TD3's (Fujimoto et al., 2018), the mean action, explored under
+        Gaussian noise of this deviation on [-1, 1], while targets take the next one under twice the noise, clipped at five
+        times; 0.1 gives its numbers. Without its target of the actor; needs ent_coef=0.0
     :param preference_sampler: `rng -> (n_objectives,)` for all environments, or a literal as `make_sampler` takes it; None
         leaves them theirs, by default uniform on the simplex once an episode
     :param precision: of an update's products: "float32", "bfloat16", or "auto", bfloat16 if the device has instructions for it
@@ -112,6 +115,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         ent_coef_learning_rate: float | None = None,
         policy_delay: int = 1,
         noise_repeat: int = 1,
+        td3_noise: float | None = None,
         preference_sampler: PreferenceSampler | SamplerSpec | None = None,
         precision: str = "float32",
         compile: bool = False,
@@ -176,6 +180,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self.ent_coef_learning_rate = ent_coef_learning_rate
         self.policy_delay = policy_delay
         self.noise_repeat = noise_repeat
+        self.td3_noise = td3_noise
         self.preference_sampler = preference_sampler
         self.log_ent_coef: th.Tensor | None = None
         self.ent_coef_optimizer: th.optim.Optimizer | None = None
@@ -270,7 +275,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
         value = self.policy.value
         with th.no_grad():
             with without_batch_statistics(self.actor):
-                next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+                next_actions, next_log_prob = self._act(batch.next_observations)
+                if self.td3_noise is not None:
+                    next_actions = td3_smoothed(next_actions, self.td3_noise)
             # Batch norm takes its statistics from both at once, so that predictions and targets are normalised alike.
             now, next_ = (batch.observations, batch.actions), (batch.next_observations, next_actions)
             targets = value.bootstrap(
@@ -297,7 +304,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def _actor_loss(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> tuple[th.Tensor, th.Tensor, Metrics]:
         """Eq. (3.18), with eq. (3.21)'s alignment if it is on. Also returns log pi(a | s, w), (batch,)."""
-        actions, log_prob = self.actor.action_log_prob(batch.observations)
+        actions, log_prob = self._act(batch.observations)
         # Of batch norm, only the network that takes the step sees the batch: critics judge a new action as they would alone.
         with without_batch_statistics(self.critic):
             q_vector = self.policy.value.mean(self.critic(batch.observations, actions))
@@ -308,6 +315,12 @@ class MOMBA(PreferenceConditionedAlgorithm):
             q = q * th.cosine_similarity(q_vector, batch.preferences[:, None], dim=-1)
         loss = (alpha * log_prob - q.min(dim=1).values).mean()
         return loss, log_prob.detach(), {"actor_loss": loss.detach(), "entropy": -log_prob.detach().mean()}
+
+    def _act(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """a ~ pi(. | s, w), (batch, action_dim), and log pi, (batch,); TD3's mean action has none."""
+        if self.td3_noise is None:
+            return self.actor.action_log_prob(observations)
+        return self.actor(observations, deterministic=True), observations.new_zeros(len(observations))
 
     def _alpha_loss(self, log_prob: th.Tensor) -> th.Tensor:
         """Eq. (3.19) with alpha = exp(beta)."""
@@ -328,3 +341,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
     """u_w(v) = w.v (Definition 3): the last dimension, n_objectives, is summed away."""
     return (preferences * values).sum(dim=-1)
+
+
+def td3_smoothed(actions: th.Tensor, noise: float) -> th.Tensor:
+    """TD3's target policy smoothing on [-1, 1]: with 0.1, a deviation of 0.2, clipped at 0.5."""
+    return (actions + (2 * noise * th.randn_like(actions)).clamp(-5 * noise, 5 * noise)).clamp(-1, 1)

@@ -105,6 +105,9 @@ def check_settings(model: Any) -> None:
     own_rate = settings["ent_coef_learning_rate"]
     if own_rate is not None and not (is_number(own_rate) and own_rate >= 0):
         raise ValueError(f"ent_coef_learning_rate={own_rate!r}: give a number of at least 0, or None for learning_rate.")
+    td3 = settings["td3_noise"]
+    if td3 is not None and not (is_number(td3) and td3 >= 0):
+        raise ValueError(f"td3_noise={td3!r}: give a deviation of at least 0, or None for a stochastic policy.")
     _check_together(model, settings)
     check_policy_kwargs(model.policy_class, settings["policy_kwargs"])
 
@@ -116,6 +119,12 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
         raise ValueError(
             f"noise_repeat={model.noise_repeat} with deterministic_exploration=True: the mean action has no noise."
         )
+    if model.td3_noise is not None and parse_ent_coef(model.ent_coef) != (False, 0.0):
+        raise ValueError(
+            f"td3_noise={model.td3_noise} with ent_coef={model.ent_coef!r}: the mean action has no entropy: set it to 0.0."
+        )
+    if model.td3_noise is not None and model.deterministic_exploration:
+        raise ValueError(f"td3_noise={model.td3_noise} with deterministic_exploration=True: leave one of them out.")
     if model.ent_coef_learning_rate is not None and not parse_ent_coef(model.ent_coef)[0]:
         raise ValueError(
             f"ent_coef_learning_rate={model.ent_coef_learning_rate} with ent_coef={model.ent_coef!r}, which is fixed: leave "

@@ -9,6 +9,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_momba import MOMBA, MombaCheckpointCallback
 from sb3_momba.exploration import HeldNoise
+from sb3_momba.momba import td3_smoothed
 from sb3_momba.nn.normalization import DeviationScale
 from sb3_momba.settings import parse_target_entropy
 from tests.stubs import StubEnv, tiny_model
@@ -139,16 +140,84 @@ def test_going_on_may_hold_noise_for_another_time(tmp_path):
     assert again._held_noise.noise is not None
 
 
+# ------------------------------------------------------------------------------------------------------------- TD3
+
+
+def test_td3_explores_under_noise_around_the_mean_action():
+    model = trained(td3_noise=0.1, ent_coef=0.0)
+    mean = model.policy.scale_action(model.predict(model._last_obs, deterministic=True)[0])
+    actions = np.array([model._sample_action(0)[1] for _ in range(1_000)])
+    deviations = np.clip(actions, -0.999, 0.999) - mean
+    assert np.abs(mean).max() < 0.5  # so that nothing is clipped
+    np.testing.assert_allclose(deviations.mean(axis=0), 0, atol=4 * 0.1 / 1_000**0.5)
+    np.testing.assert_allclose(deviations.std(axis=0), 0.1, rtol=0.09)
+
+
+def test_td3_targets_are_smoothed_by_twice_the_noise_and_clipped_at_five_times():
+    th.manual_seed(0)
+    noise = td3_smoothed(th.full((100_000, 1), 0.1), 0.1) - 0.1
+    assert float(noise.abs().max()) == pytest.approx(0.5)
+    # Of a normal deviate x, E[min(|x|, 2.5)^2] = 0.9776.
+    assert float(noise.std()) == pytest.approx(0.2 * 0.9776**0.5, rel=0.01)
+    assert float(td3_smoothed(th.ones(1_000, 1), 0.1).max()) == 1
+    assert th.equal(td3_smoothed(th.full((3, 2), 0.3), 0.0), th.full((3, 2), 0.3))
+
+
+def test_td3_learns_the_mean_action_alone():
+    """The gradient of -min Q at the mean action, by hand; the standard deviation has none."""
+    model = trained(td3_noise=0.1, ent_coef=0.0)
+    batch = model._sample(8)
+    loss, log_prob, _ = model._actor_loss(batch, model.alpha)
+    actions = model.actor(batch.observations, deterministic=True)
+    by_hand = -model.policy.value.mean(model.critic(batch.observations, actions)).squeeze(-1).min(dim=1).values.mean()
+    assert float(loss.detach()) == pytest.approx(float(by_hand.detach()), rel=1e-6)
+    assert not log_prob.any()
+    gradients = th.autograd.grad(loss, list(model.actor.parameters()), allow_unused=True)
+    named = zip(dict(model.actor.named_parameters()), gradients, strict=True)
+    without = [name for name, gradient in named if gradient is None or not gradient.any()]
+    assert without
+    assert all(name.startswith("log_std_head") for name in without)
+    before = parameters_of(model.actor)
+    model.train(1, 8)
+    assert not same(before, parameters_of(model.actor), 1e-6)
+    assert model.alpha == 0
+
+
+def test_td3_has_no_entropy_in_its_targets():
+    model = trained(td3_noise=0.0, ent_coef=0.0, critic_loss="mse")
+    batch = model._sample(8)
+    loss, _ = model._critic_loss(batch, model.alpha)
+    with th.no_grad():
+        next_actions = model.actor(batch.next_observations, deterministic=True)
+        next_q = model.critic_target(batch.next_observations, next_actions).flatten(1).min(dim=1).values
+        rewards = (batch.rewards * batch.preferences).sum(dim=1)
+        targets = rewards + batch.discounts * (1 - batch.dones) * next_q
+        q = model.critic(batch.observations, batch.actions).flatten(1)
+    assert float(loss.detach()) == pytest.approx(float((q - targets[:, None]).square().sum(dim=1).mean()), rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        ({"td3_noise": 0.1}, r"td3_noise=0\.1 with ent_coef='auto_0\.2'.*0\.0"),
+        ({"td3_noise": -1.0, "ent_coef": 0.0}, r"td3_noise=-1\.0: give a deviation"),
+        ({"td3_noise": 0.1, "ent_coef": 0.0, "deterministic_exploration": True}, "leave one of them out"),
         ({"noise_repeat": 2, "deterministic_exploration": True}, "noise_repeat=2 with deterministic_exploration"),
         ({"ent_coef": 0.1, "ent_coef_learning_rate": 1e-3}, "ent_coef_learning_rate=0.001 with ent_coef=0.1, which is fixed"),
         ({"replay_buffer_kwargs": {"n_relabels": 2}}, "n_relabels=2, where no preference is relabelled"),
         ({"her": True, "her_kwargs": {"n_relabels": 2, "keep_probability": 1.0}}, "n_relabels=2, where no"),
         ({"her": True, "replay_buffer_kwargs": {"n_relabels": 3}, "batch_size": 8}, "does not divide batch_size=8"),
     ],
-    ids=["noise of the mean", "rate of a fixed alpha", "relabels without HER", "relabels that all keep", "rows"],
+    ids=[
+        "TD3 with entropy",
+        "negative noise",
+        "two ways to explore",
+        "noise of the mean",
+        "rate of a fixed alpha",
+        "relabels without HER",
+        "relabels that all keep",
+        "rows",
+    ],
 )
 def test_what_would_be_ignored_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
