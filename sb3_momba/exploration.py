@@ -1,4 +1,4 @@
-"""Noise that moves actions the same way for several steps, which single draws at every step average away."""
+"""Noise on actions: held for several steps while exploring, and TD3's in the targets."""
 
 import torch as th
 
@@ -7,7 +7,8 @@ EXPONENT = 2.0
 
 class HeldNoise:
     """Standard normal noise, each draw kept for n steps of its environment, P(n) proportional to n^-2 (the zeta distribution
-    of Dabney et al., 2021, cut off as in FlashSAC).
+    of Dabney et al., 2021, cut off as in FlashSAC): it moves actions the same way for a while, where new draws at every step
+    average away.
 
     :param longest: largest n
     """
@@ -34,3 +35,8 @@ class HeldNoise:
     def load_state_dict(self, state: dict[str, th.Tensor | None]) -> None:
         """:param state: of `state_dict`"""
         vars(self).update(state)
+
+
+def td3_smoothed(actions: th.Tensor, noise: float) -> th.Tensor:
+    """TD3's target policy smoothing on [-1, 1]: with 0.1, a deviation of 0.2, clipped at 0.5."""
+    return (actions + (2 * noise * th.randn_like(actions)).clamp(-5 * noise, 5 * noise)).clamp(-1, 1)

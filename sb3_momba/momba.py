@@ -16,6 +16,7 @@ from sb3_momba.buffers import PreferenceReplayBuffer, PreferenceReplayBufferSamp
 from sb3_momba.diagnostics import Metrics
 from sb3_momba.envs.making import n_objectives_of
 from sb3_momba.envs.preferences import PreferenceSampler, SamplerSpec
+from sb3_momba.exploration import td3_smoothed
 from sb3_momba.nn.batch_norm import follow_batch_statistics, without_batch_statistics
 from sb3_momba.nn.descent import NonFiniteLossError, descend, move_towards
 from sb3_momba.nn.distributional import lowest
@@ -62,6 +63,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
         deviation in each dimension (FlashSAC)
     :param ent_coef_learning_rate: of the entropy coefficient alone; None: `learning_rate`
     :param policy_delay: updates of the critics for each of the actor and the entropy coefficient (TD3, Fujimoto et al., 2018)
+    :param reset_interval: updates after which networks and optimisers start again, while the replay buffer, the statistics and
+        alpha stay (Nikishin et al., 2022); None: never
     :param noise_repeat: most steps for which the noise of one sampled action is kept (FlashSAC); 1: new noise at every step
     :param td3_noise: None: SAC's stochastic policy. A number: TD3's (Fujimoto et al., 2018), the mean action, explored under
         Gaussian noise of this deviation on [-1, 1], while targets take the next one under twice the noise, clipped at five
@@ -114,6 +117,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         target_entropy: str | float = "auto",
         ent_coef_learning_rate: float | None = None,
         policy_delay: int = 1,
+        reset_interval: int | None = None,
         noise_repeat: int = 1,
         td3_noise: float | None = None,
         preference_sampler: PreferenceSampler | SamplerSpec | None = None,
@@ -179,6 +183,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self.target_entropy = target_entropy
         self.ent_coef_learning_rate = ent_coef_learning_rate
         self.policy_delay = policy_delay
+        self.reset_interval = reset_interval
         self.noise_repeat = noise_repeat
         self.td3_noise = td3_noise
         self.preference_sampler = preference_sampler
@@ -222,6 +227,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
 
     def _gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
         """One pass through the inner loop of Algorithm 1."""
+        if self.reset_interval is not None and self._n_updates > 0 and self._n_updates % self.reset_interval == 0:
+            self.policy.reset_networks()
         alpha = self.alpha
         with self._rounded_products():
             critic_loss, metrics = self._critic_loss(batch, alpha)
@@ -341,8 +348,3 @@ class MOMBA(PreferenceConditionedAlgorithm):
 def scalarise(values: th.Tensor, preferences: th.Tensor) -> th.Tensor:
     """u_w(v) = w.v (Definition 3): the last dimension, n_objectives, is summed away."""
     return (preferences * values).sum(dim=-1)
-
-
-def td3_smoothed(actions: th.Tensor, noise: float) -> th.Tensor:
-    """TD3's target policy smoothing on [-1, 1]: with 0.1, a deviation of 0.2, clipped at 0.5."""
-    return (actions + (2 * noise * th.randn_like(actions)).clamp(-5 * noise, 5 * noise)).clamp(-1, 1)

@@ -137,6 +137,15 @@ class MombaPolicy(BasePolicy):
             project_weights(self.critic)
 
     @th.no_grad()
+    def reset_networks(self) -> None:
+        """New weights for actor, critics and targets, and optimisers that remember nothing; the statistics stay."""
+        new = type(self)(lr_schedule=self._dummy_schedule, **self._all_arguments).to(self.device)
+        for name in ("actor", "critic", "critic_target"):
+            getattr(self, name).load_state_dict(getattr(new, name).state_dict())
+        for network in (self.actor, self.critic):
+            network.optimizer.state.clear()
+
+    @th.no_grad()
     def explore(self, observation: np.ndarray, noise: Callable[[th.Tensor], th.Tensor]) -> np.ndarray:
         """Actions on [-1, 1], (batch, action_dim), sampled with this standard normal noise.
 
@@ -200,16 +209,19 @@ class MombaPolicy(BasePolicy):
 
         :raises TypeError: names an argument that cannot be stored without pickle
         """
-        spaces = {"observation_space": self.observation_space, "action_space": self.action_space}
         write_tree(
             path,
             {
                 **header(POLICY_FORMAT),
                 "policy": type(self).__name__,
-                "arguments": {**spaces, **self.arguments},
+                "arguments": self._all_arguments,
                 "state_dict": dict(self.state_dict()),
             },
         )
+
+    @property
+    def _all_arguments(self) -> dict[str, Any]:
+        return {"observation_space": self.observation_space, "action_space": self.action_space, **self.arguments}
 
     @classmethod
     def load(cls: type[Self], path: FilePath, device: th.device | str = "auto") -> Self:  # type: ignore[override]

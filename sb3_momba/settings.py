@@ -80,6 +80,8 @@ def check_settings(model: Any) -> None:
         check_switch(name, settings[name])
     for name, least in WHOLE_NUMBERS.items():
         check_whole(name, settings[name], least)
+    if settings["reset_interval"] is not None:
+        check_whole("reset_interval", settings["reset_interval"], 1, ", or None for never")
     if settings["gradient_steps"] != -1:
         check_whole("gradient_steps", settings["gradient_steps"], 0, "; -1 makes as many as steps were taken")
     for name, (low, high) in RANGES.items():

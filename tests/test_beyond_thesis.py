@@ -8,9 +8,9 @@ import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_momba import MOMBA, MombaCheckpointCallback
-from sb3_momba.exploration import HeldNoise
-from sb3_momba.momba import td3_smoothed
+from sb3_momba.exploration import HeldNoise, td3_smoothed
 from sb3_momba.nn.normalization import DeviationScale
+from sb3_momba.policies import SHIPPED_POLICIES
 from sb3_momba.settings import parse_target_entropy
 from tests.stubs import StubEnv, tiny_model
 
@@ -138,6 +138,43 @@ def test_going_on_may_hold_noise_for_another_time(tmp_path):
     again = MOMBA.resume(tmp_path, StubEnv(), noise_repeat=2)
     assert len(again._held_noise.probabilities) == again.noise_repeat == 2
     assert again._held_noise.noise is not None
+
+
+# ----------------------------------------------------------------------------------------------------------- resets
+
+
+@pytest.mark.parametrize("policy", [policy.__name__ for policy in SHIPPED_POLICIES])
+def test_networks_start_again_and_the_rest_stays(policy):
+    model = tiny_model(StubEnv(), policy=policy, learning_starts=100, reset_interval=3, learning_rate=1e-3).learn(40)
+    first = parameters_of(model.critic)
+    model.train(3, 8)
+    trained_for_long, alpha = parameters_of(model.critic), model.alpha.clone()
+    statistics = model.policy.statistics.state_dict()
+    model.policy.reset_networks()
+    new = parameters_of(model.critic)
+    assert not same(first, new, 1e-3)
+    assert not same(trained_for_long, new, 1e-3)
+    assert same(new, parameters_of(model.critic_target))
+    assert not any(parameter.requires_grad for parameter in model.critic_target.parameters())
+    assert not model.critic.optimizer.state
+    assert not model.actor.optimizer.state
+    assert th.equal(alpha, model.alpha)
+    assert all(th.equal(value, model.policy.statistics.state_dict()[name]) for name, value in statistics.items())
+    model.train(2, 8)
+    assert not same(new, parameters_of(model.critic), 1e-6)
+
+
+def test_a_reset_comes_before_each_update_whose_number_the_interval_divides(monkeypatch):
+    model, resets = trained(reset_interval=3), []
+    monkeypatch.setattr(model.policy, "reset_networks", lambda: resets.append(model._n_updates))
+    model.train(8, 8)
+    assert resets == [3, 6]
+
+
+@pytest.mark.parametrize("wrong", [0, 1.5, True], ids=str)
+def test_a_wrong_interval_is_named(wrong):
+    with pytest.raises(ValueError, match=f"reset_interval={wrong}.*whole number"):
+        tiny_model(StubEnv(), reset_interval=wrong)
 
 
 # ------------------------------------------------------------------------------------------------------------- TD3
