@@ -503,6 +503,19 @@ def test_networks_are_as_large_as_the_thesis_says(of_all_tasks) -> None:
     assert round(np.mean(sizes)) == {"pgmorl": 17_551, "gpi_ls": 259_119, "dpmorl": 17_477}[algorithm]
 
 
+def test_policies_of_pgmorl_begin_with_the_gains_of_its_authors(of_all_tasks) -> None:
+    """An orthogonal matrix has its gain as every singular value: 1 for mean actions, the root of 2 for values."""
+    algorithm, made = of_all_tasks
+    if algorithm != "pgmorl":
+        return
+    for baseline in made.values():
+        policies: Any = baseline.agent.agents
+        for policy in policies:
+            for head, gain in ((policy.networks.actor_mean[-1], 1.0), (policy.networks.critic[-1], 2**0.5)):
+                np.testing.assert_allclose(th.linalg.svdvals(head.weight.detach()), gain, rtol=1e-5)
+                assert not head.bias.any()
+
+
 def test_each_task_has_actions_for_its_start(of_all_tasks) -> None:
     algorithm, made = of_all_tasks
     for task, one in made.items():

@@ -52,6 +52,17 @@ def remembered_predictions(predictor: Any) -> Iterator[None]:
         del predictor.predict_next_evaluation  # The method of its class is there again.
 
 
+def begin_as_the_authors_do(networks: Any, layer_init: Callable[..., None]) -> None:
+    """The library begins with mean actions of about 0 (gains of the last layers: 0.01 for the actor, 1 for the critic): where
+    that is standing still, short trainings never leave it.
+
+    :param networks: of one policy
+    :param layer_init: the library's
+    """
+    layer_init(networks.actor_mean[-1], weight_gain=1.0)
+    layer_init(networks.critic[-1], weight_gain=np.sqrt(2))
+
+
 class Baseline:
     """See `sb3_momba.baselines.runs.Baseline`.
 
@@ -104,6 +115,8 @@ class Baseline:
                 self.agent = Watched(env_id, np.zeros(n_objectives), log=False, seed=settings.seed, device=device, **own)
             except TypeError as error:
                 raise ValueError(f"{settings.env} cannot be made in the way that PGMORL needs it: {error}.") from error
+            for networks in self.agent.networks:
+                begin_as_the_authors_do(networks, imported("common.networks").layer_init)
             self.eval_env = CountedSteps(make_one(env_id, settings.seed, 1, "evaluation", self.agent.gamma)())
         self.judge = Judge(self.agent, settings.env)
         networks = self.agent.networks[0]
