@@ -51,7 +51,7 @@ OWN := --env MO-HalfCheetah-v4 --seeds 3
 comparison: $(VENV)/tools
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf pgmorl $(EQUAL) --steps 49920 --eval-freq 9984 \
 		--set steps_per_iteration=1664 --set num_envs=1 --output runs/comparison/pgmorl
-	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf dpmorl dpmorl_state $(EQUAL) --steps 5e4 --eval-freq 1e4 \
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf dpmorl dpmorl_state $(EQUAL) --steps 5e4 --eval-freq 1e4 --set n_envs=1 \
 		--output runs/comparison/dpmorl
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf gpi_ls_utd_1 --env MO-HalfCheetah-v4 MO-Walker2d-v4 --seeds 3 \
 		--steps 5e4 --eval-freq 1e4 --output runs/comparison/gpi_ls

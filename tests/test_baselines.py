@@ -459,7 +459,7 @@ def of_all_tasks(request, tmp_path_factory) -> tuple[str, dict[str, Baseline]]:
     """Each baseline on each task, in networks of its own size."""
     small: dict[str, dict[str, Any]] = {
         "pgmorl": {"num_envs": 1, "steps_per_iteration": 32, "num_minibatches": 4},
-        "gpi_ls": {"buffer_size": 100},
+        "gpi_ls": {"buffer_size": 200},
         "dpmorl": {"n_envs": 1, "augment_state": False},
     }
     algorithm, made = request.param, {}
@@ -605,8 +605,8 @@ def test_a_schedule_that_cannot_be_is_refused(n: int, given: tuple[Any, Any], me
 @pytest.mark.parametrize(
     ("steps", "message"),
     [
-        (1_000_000, r"49,152 steps.*give 983,040 \(20\) or 1,032,192 \(21\)\.$"),
-        (100_000, r"give 245,760 \(5\)\.$"),
+        (1_000_000, r"49,152 steps.*give 983,040 \(20\) or 1,032,192 \(21\); 5 are the least\.$"),
+        (100_000, r"give 245,760 \(5\); 5 are the least\.$"),
     ],
     ids=range(2),
 )
@@ -698,8 +698,10 @@ def test_a_command_trains_and_prints_its_curve(tmp_path, capsys) -> None:
         ("gpi_ls", "--steps 130", "steps=130 is no whole number of iterations of 40: give 120 or 160"),
         ("gpi_ls", "--steps 30", "steps=30 .*: give 40, or"),
         ("pgmorl", "--steps 1000", r"1,000 is no whole number .* 128 steps .*: give 896 \(7\) or 1,024 \(8\)"),
+        ("gpi_ls", "--set buffer_size=100", "buffer_size=100: a minibatch of batch_size=128 must fit"),
+        ("gpi_ls", "--set learning_starts=160", "learning_starts=160 with steps=120: nothing would"),
         ("pgmorl", "--set pop_size=6", "pop_size=6: delta_weight=.* gives 4 weights"),
-        ("pgmorl", "--set delta_weight=0.5", "gives 3 weights: PGMORL predicts from 4 policies"),
+        ("pgmorl", "--set delta_weight=0.5", "gives 3 weights: PGMORL predicts from 4 policies.*divide 1"),
         ("pgmorl", "--set delta_weight=0", "delta_weight=0: give"),
         ("pgmorl", "--set num_minibatches=3", "num_minibatches=3: .* = 32"),
         ("pgmorl", "--env Steer4-v0", "has 4 objectives: PGMORL takes two or three"),
@@ -725,7 +727,7 @@ def test_a_command_trains_and_prints_its_curve(tmp_path, capsys) -> None:
         ("gpi_ls", "--set alpha=2", "alpha=2: it must be from 0 to 1"),
         *((algorithm, "--device gpu", "device='gpu' is no device .* give auto, cpu or cuda") for algorithm in ALGORITHMS),
     ],
-    ids=range(40),
+    ids=range(42),
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path, algorithm: str, more: str, message: str, capfd) -> None:
     folder = tmp_path / "run"

@@ -645,6 +645,22 @@ def test_an_area_begins_at_the_first_evaluation(fake) -> None:
     np.testing.assert_allclose(areas_under_curve(runs), [3, (15 + 100) / 30])
 
 
+def test_areas_of_a_task_begin_where_all_methods_have_been_evaluated(fake) -> None:
+    """At 20: the poor beginning of whom is evaluated often, 0 until then, counts no more than that of the other."""
+    made = [fake(box(4.0), {10: box(0.0), 30: box(4.0), 40: box(4.0)}), fake(box(4.0), {20: box(2.0), 40: box(4.0)}, label="b")]
+    made.append(fake(box(4.0), {40: box(4.0)}, label="once"))
+    often, rarely, once = (runs[0].mean_over_steps for runs in only(compare(made)).methods.values())
+    assert (often, rarely) == (3.5, 3)
+    assert np.isnan(once)
+
+
+@pytest.mark.parametrize(("steps", "said"), [(10_000, True), (9_990, False)])
+def test_unequal_budgets_are_said(fake, tmp_path, steps: int, said: bool) -> None:
+    made = [fake(box(4.0), {5_000: box(1.0), steps: box(4.0)}), fake(box(4.0), {5_000: box(1.0), 9_900: box(4.0)}, label="b")]
+    text = write_report(compare(made), made, tmp_path)
+    assert ("Methods had unequal numbers of steps on" in text) is said
+
+
 @pytest.mark.parametrize(
     ("volumes", "median"),
     [([3, 1, 2], 2), ([4, 1, 3, 2], 2), ([5], 5), ([2, 1], 1), ([None, 3, 1, None, 2], 2), ([None], None)],

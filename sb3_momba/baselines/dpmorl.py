@@ -5,6 +5,7 @@ Utility functions of vector returns are generated that differ from one another; 
 dominates are marked among the solutions.
 """
 
+import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,6 +51,8 @@ DEFAULTS: dict[str, Any] = {
 }
 LONGEST_ROLLOUT = 2048  # steps of each environment, as in SB3
 FEWEST_ROLLOUTS = 25  # of a policy: as many as a million steps have
+
+logger = logging.getLogger(__name__)
 
 
 class PolicyOfReturns:
@@ -125,6 +128,16 @@ class Baseline:
             raise ValueError(f"linear_share={chosen['linear_share']}: give a share above 0 and up to 1.")
         n_policies, n_envs = chosen["n_policies"], chosen["n_envs"]
         chosen["n_steps"] = rollout_steps(settings.steps, n_policies, n_envs, chosen["n_steps"])
+        limit, of_env = gym.spec(raw_id(settings.env)).max_episode_steps, settings.steps // n_policies // n_envs
+        if limit is not None and of_env < limit:
+            logger.warning(
+                "Each of the n_envs=%d environments of a policy has %d steps, fewer than an episode of %s may have (%d): "
+                "no policy may ever see a whole return. Give more steps, or fewer environments.",
+                n_envs,
+                of_env,
+                settings.env,
+                limit,
+            )
         self.finished: list[Trained] = []
         self.finished_steps = self.extra_steps = 0
         # Any range will do for a model that is not trained, and only shows what can be built.
@@ -159,7 +172,7 @@ class Baseline:
                 self.venv,
                 n_steps=chosen["n_steps"],
                 policy_kwargs={"net_arch": chosen["net_arch"]},
-                seed=self.settings.seed * chosen["n_policies"] + index,
+                seed=int(np.random.SeedSequence([self.settings.seed, index]).generate_state(1)[0]),
                 device=device_of(self.settings.device),
                 **{name: chosen[name] for name in OF_PPO},
             )

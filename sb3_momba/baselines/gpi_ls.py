@@ -56,6 +56,11 @@ class Baseline:
         known = {**hyperparameters_of(parent, not_its), **OF_TRAIN}
         self.hyperparameters = completed("gpi_ls", settings.hyperparameters, known)
         self.settings = settings
+        buffer, batch, starts = (self.hyperparameters[name] for name in ("buffer_size", "batch_size", "learning_starts"))
+        if buffer < batch:
+            raise ValueError(f"buffer_size={buffer}: a minibatch of batch_size={batch} must fit.")
+        if starts >= settings.steps:
+            raise ValueError(f"learning_starts={starts} with steps={settings.steps:,}: nothing would ever be learned.")
         per_iteration = self.hyperparameters["timesteps_per_iter"]
         if settings.steps % per_iteration:
             fewer = settings.steps // per_iteration * per_iteration

@@ -143,7 +143,7 @@ class Baseline:
         if n_weights < LEAST_POLICIES:
             raise ValueError(
                 f"delta_weight={complete['delta_weight']} gives {n_weights} weights: PGMORL predicts from {LEAST_POLICIES} "
-                "policies or more."
+                "policies or more, and delta_weight must divide 1."
             )
         complete["pop_size"] = n_weights
         batch = complete["steps_per_iteration"] * complete["num_envs"]

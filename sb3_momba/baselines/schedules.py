@@ -92,6 +92,6 @@ def iterations(steps: int, per_iteration: int) -> int:
         near = " or ".join(f"{k * per_iteration:,} ({k})" for k in sorted({max(n, WARMUP + 1), max(n + 1, WARMUP + 1)}))
         raise ValueError(
             f"steps={steps:,} is no whole number of iterations of {per_iteration:,} steps (steps_per_iteration x num_envs x "
-            f"pop_size): give {near}."
+            f"pop_size): give {near}; {WARMUP + 1} are the least."
         )
     return n

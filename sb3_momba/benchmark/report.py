@@ -33,9 +33,9 @@ scores it covers the truth in 71 % of cases with 3 seeds, 89 % with 5, 95 % with
 that failed or did not end counts with the hypervolume 0 and with the worst expected utility and IGD among the floors and the
 finished runs; regret is of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all final solutions in
 this report (section 4.4), so it changes with the records; there is none where the envelope is one point. The two columns of
-the curve are mean hypervolumes, areas under it divided by its length: over steps from the first evaluation to the last; over
-time up to the seconds of training (of one processor, without evaluations) that every finished run had, from the better of the
-policies that learned nothing to the first evaluation in a straight line.
+the curve are mean hypervolumes, areas under it divided by its length: over steps from the first evaluation that all methods
+of the task have to the last; over time up to the seconds of training (of one processor, without evaluations) that every
+finished run had, from the better of the policies that learned nothing to the first evaluation in a straight line.
 """
 
 
@@ -106,6 +106,16 @@ def has_extra_steps(task: Task) -> bool:
     return any(run.record.extra_steps for runs in task.methods.values() for run in runs)
 
 
+def has_unequal_budgets(task: Task) -> bool:
+    """By more than a hundredth: not every method can have any number of steps."""
+    steps = [last_step(runs) for runs in task.methods.values()]
+    return max(steps, default=0) > 1.01 * min(steps, default=0)
+
+
+def last_step(runs: Sequence[Run]) -> int:
+    return max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
+
+
 def task_table(task: Task) -> str:
     """Extra steps have a column where any method has some."""
     with_extra = has_extra_steps(task)
@@ -115,13 +125,12 @@ def task_table(task: Task) -> str:
         rows.append([f"({name})", "", "", *[""] * with_extra, "", f"{volume:,.5g}", f"{utility:,.5g}", "", igd, "", ""])
     for name, runs in task.methods.items():
         finished = sum(run.is_finished for run in runs)
-        steps = max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
         parameters = sum(parameters_of(runs).values())
         scores = [[getattr(run, column) for run in runs] for column in COLUMNS.values()]
         known = [[score for score in column if np.isfinite(score)] for column in scores]
         estimates = [as_text(estimate(interquartile_mean, [column])) if column else "" for column in known]
         extra = [f"{max(run.record.extra_steps for run in runs):,}"] * with_extra
-        rows.append([name, f"{finished}/{len(runs)}", f"{steps:,}", *extra, f"{parameters:,}", *estimates])
+        rows.append([name, f"{finished}/{len(runs)}", f"{last_step(runs):,}", *extra, f"{parameters:,}", *estimates])
     return markdown(rows)
 
 
@@ -141,7 +150,11 @@ def comparison_table(tasks: Sequence[Task]) -> str:
             x, y = ([[run.hypervolume for run in methods[name]] for methods in shared] for name in (row, column))
             cells.append(f"{as_text(estimate(probability_of_improvement, x, y))} ({len(shared)} tasks)")
         rows.append([row, *cells])
-    return "## Probability of improvement\n\nOf the row's method over the column's, in hypervolume.\n\n" + markdown(rows)
+    introduction = "## Probability of improvement\n\nOf the row's method over the column's, in hypervolume."
+    unequal = [task.name for task in tasks if has_unequal_budgets(task)]
+    if unequal:
+        introduction += f" Methods had unequal numbers of steps on {', '.join(unequal)}."
+    return introduction + "\n\n" + markdown(rows)
 
 
 def aggregate_table(tasks: Sequence[Task], baseline: str) -> str:

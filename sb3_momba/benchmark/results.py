@@ -117,12 +117,16 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
         method: [_score(record, reference, front, earned) for record in its_records]
         for method, its_records in name_methods(records).items()
     }
-    seconds, start = common_seconds(methods), max((volume for volume, _, _ in floors.values()), default=0.0)
+    first, seconds, start = (
+        common_first_step(methods),
+        common_seconds(methods),
+        max((volume for volume, _, _ in floors.values()), default=0.0),
+    )
     methods = {
         method: [
             replace(run, mean_over_steps=over_steps, mean_over_time=over_time)
             for run, over_steps, over_time in zip(
-                runs, areas_under_curve(runs), areas_over_time(runs, seconds, start), strict=True
+                runs, areas_under_curve(runs, first), areas_over_time(runs, seconds, start), strict=True
             )
         ]
         for method, runs in methods.items()
@@ -154,9 +158,11 @@ def _check_protocol(name: str, records: Sequence[Record]) -> None:
     for record in records[1:]:
         same = np.array_equal(record.preferences, first.preferences)
         if not same or record.config.get("n_episodes") != first.config.get("n_episodes"):
+            numbers = [one.config.get("n_episodes") if same else len(one.preferences) for one in (first, record)]
             what = "episodes" if same else "preferences"
             raise ValueError(
-                f"{name} was evaluated with different {what} in {first.path} and {record.path}: report them apart."
+                f"{name} was evaluated with different {what} in {first.path} ({numbers[0]}) and {record.path} ({numbers[1]}): "
+                "report them apart."
             )
 
 
@@ -247,12 +253,23 @@ def curve_on(runs: Sequence[Run], metric: Metric = "hypervolume") -> tuple[Array
     return steps, np.array(curves)
 
 
-def areas_under_curve(runs: Sequence[Run]) -> list[float]:
-    """For each run its mean hypervolume from the method's first evaluation to its last; unknown if that is one."""
+def areas_under_curve(runs: Sequence[Run], first: float = 0.0) -> list[float]:
+    """For each run its mean hypervolume from the method's first evaluation to its last; unknown if that is one.
+
+    :param first: step to begin at, where the method's first evaluation comes before it
+    """
     steps, curves = curve_on(runs)
-    if len(steps) < 2:
+    if len(steps) < 2 or first >= steps[-1]:
         return [np.nan] * len(runs)
+    if first > steps[0]:
+        later = np.append(first, steps[steps > first])
+        steps, curves = later, np.array([np.interp(later, steps, curve) for curve in curves])
     return [float(area) for area in trapezoid(curves, steps, axis=1) / (steps[-1] - steps[0])]
+
+
+def common_first_step(methods: dict[str, list[Run]]) -> float:
+    """The latest of the methods' first evaluations: who evaluates late does not leave out its beginning."""
+    return max((float(steps[0]) for steps, _ in map(curve_on, methods.values()) if len(steps) > 1), default=0.0)
 
 
 def common_seconds(methods: dict[str, list[Run]]) -> float:
