@@ -255,7 +255,7 @@ def pickled_by_sb3(path: FilePath) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
             names = archive.namelist()
-    except zipfile.BadZipFile:  # damaged, as its reader will say
+    except Exception:  # Damaged, in any of the ways that zipfile has an error of its own for: its reader will say so.
         return False
     return "_stable_baselines3_version" in names and "tree.json" not in names
 

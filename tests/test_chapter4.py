@@ -128,7 +128,7 @@ def test_some_published_values() -> None:
 
 def test_cells_name_every_shipped_configuration_of_the_thesis() -> None:
     ours = {"capql_uniform", "actor_blocks_1", "alpha_start_1e-3", "alpha_start_1e-2", "alpha_start_5e-2", "bfloat16"}
-    ours |= {"xqc", "flashsac", "trunk_xqc", "trunk_flashsac", "momba_plus"}
+    ours |= {"xqc", "flashsac", "trunk_xqc", "trunk_flashsac", "momba_plus", "td3"}
     assert layout.all_labels() - BASELINES == set(shipped_configurations()) - ours
 
 

@@ -748,6 +748,17 @@ def test_a_file_of_another_format_or_version_is_an_error(tmp_path):
         MOMBA.load(tmp_path / "newer.zip")
 
 
+def test_a_zip_of_a_version_that_there_is_not_is_damaged(tmp_path):
+    """Byte 6 of an entry of the central directory says which version reads it."""
+    path = tmp_path / "model.zip"
+    tiny_model(StubEnv()).save(path)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 6] = 109
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"model\.zip is damaged.*version 10\.9"):
+        MOMBA.load(path)
+
+
 def test_a_damaged_model_file_is_an_error_that_names_it(tmp_path):
     path = tmp_path / "model.zip"
     tiny_model(StubEnv()).learn(25).save(path)

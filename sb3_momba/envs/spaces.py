@@ -44,7 +44,7 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
             "gymnasium.wrappers.FlattenObservation, images after a feature extractor of your own."
         )
     if not isinstance(action_space, spaces.Box):
-        raise UnsupportedSpaceError(f"The action space {action_space} is not supported: actions must be continuous, a Box.")
+        raise UnsupportedSpaceError(f"The action space {action_space} is not supported: continuous actions, a Box, are needed.")
     if len(action_space.shape) != 1 or action_space.shape[0] == 0:
         raise UnsupportedSpaceError(
             f"The action space {action_space} has shape {action_space.shape}: flatten it to (n,) with an ActionWrapper."
