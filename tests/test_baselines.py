@@ -25,6 +25,7 @@ from sb3_momba.baselines.returns import UtilityReward
 from sb3_momba.baselines.runs import Baseline, make_baseline, run
 from sb3_momba.baselines.schedules import OF_OTHERS, SCRIPTS, Script, default_steps, iterations, schedule
 from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
+from sb3_momba.baselines.utilities import linear_utilities
 from sb3_momba.benchmark.__main__ import main as benchmark
 from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.records import Record, read_record
@@ -328,6 +329,25 @@ def test_each_policy_of_dpmorl_is_trained_for_its_own_utility(tmp_path, monkeypa
         assert total == pytest.approx(f[0] - f[1], abs=1e-6)
     means = [total - z.sum() for index, _, _, z, total in episodes if index > 0]
     assert max(np.abs(means)) > 0.1  # The others' rewards are not the first one's, the sum of both objectives.
+
+
+@pytest.mark.parametrize(("n_envs", "said"), [(20, True), (1, False)])
+def test_dpmorl_warns_where_no_policy_may_see_a_whole_return(tmp_path, caplog, n_envs: int, said: bool) -> None:
+    """50,000 steps of 10 policies in 20 environments are 250 of each; an episode has 500."""
+    settings = BaselineSettings(
+        "dpmorl", "MO-HalfCheetah-v4", str(tmp_path / "run"), 50_000, hyperparameters={"n_envs": n_envs}
+    )
+    make_baseline(settings, 2).close()
+    assert ("has 250 steps, fewer than an episode of MO-HalfCheetah-v4 may have (500)" in caplog.text) is said
+
+
+def test_each_policy_of_dpmorl_has_a_seed_of_its_own_whatever_the_runs(tmp_path) -> None:
+    """Neighbouring seeds of a run share none, and the largest 32-bit one is taken."""
+    seeds = []
+    for seed in (0, 1, 2**32 - 1):
+        made: Any = make_baseline(settings_of("dpmorl", tmp_path, seed=seed), 2)
+        seeds += [made._make_model(index, linear_utilities(2)[0]).seed for index in range(2)]
+    assert len(set(seeds)) == 6
 
 
 def test_the_statistics_of_pgmorl_are_of_all_its_environments(tiny) -> None:
