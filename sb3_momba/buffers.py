@@ -10,11 +10,12 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_momba.envs.preferences import preference_dim
+from sb3_momba.envs.preferences import corner_weights, preference_dim
 from sb3_momba.envs.wrappers import LARGEST_REWARD
 from sb3_momba.finite import all_finite
 
 SMALLEST_CONCENTRATION = 1e-3
+STEPS_OF_FRONT = 20_000
 SCALARISATION_TOLERANCE = 1e-4
 STORED_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
 
@@ -49,6 +50,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
     :param keep_probability: p_keep of hindsight relabelling, eq. (3.20); 1 switches it off
     :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
     :param n_relabels: rows of a minibatch that come from one transition, each with a preference of its own
+    :param corner_probability: share of the relabelled preferences that are drawn from the corner weights of the newest
+        episodes' returns instead of eq. (3.20) (linear support, as in GPI-LS)
     :param seed: of the buffer's own random stream
     :param handle_timeout_termination: SB3's switch, always on: a truncated episode's last state keeps its value
     :raises ValueError: for a switch that is turned, or a number out of its range
@@ -71,6 +74,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         keep_probability: float = 1.0,
         concentration: float = 5.0,
         n_relabels: int = 1,
+        corner_probability: float = 0.0,
         seed: int | None = None,
         handle_timeout_termination: bool = True,
     ):
@@ -82,10 +86,10 @@ class PreferenceReplayBuffer(ReplayBuffer):
             raise ValueError(f"n_steps={n_steps}: a return sums over at least 1 step.")
         if n_relabels < 1:
             raise ValueError(f"n_relabels={n_relabels}: each transition has at least 1 preference.")
-        if not 0 <= keep_probability <= 1 or concentration <= 0:
+        if not 0 <= keep_probability <= 1 or not 0 <= corner_probability <= 1 or concentration <= 0:
             raise ValueError(
-                f"keep_probability={keep_probability}, concentration={concentration}: the first is a probability, the "
-                "second positive."
+                f"keep_probability={keep_probability}, corner_probability={corner_probability}, "
+                f"concentration={concentration}: each of the first two is a probability, the third positive."
             )
         self.n_objectives = n_objectives
         self.preference_dim = preference_dim(n_objectives)
@@ -101,6 +105,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self.keep_probability = keep_probability
         self.concentration = concentration
         self.n_relabels = n_relabels
+        self.corner_probability = corner_probability
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -293,5 +298,17 @@ class PreferenceReplayBuffer(ReplayBuffer):
         relabelled = self.rng.standard_gamma(parameters)
         # Gamma draws with tiny parameters can all underflow to 0: then the preference stays.
         total = relabelled.sum(axis=1, keepdims=True)
+        relabelled = relabelled / np.where(total == 0, 1, total)
         keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None] | (total == 0)
-        return np.where(keep, preferences, relabelled / np.where(total == 0, 1, total)).astype(np.float32)
+        if self.corner_probability > 0 and len(returns := self.newest_returns()) > 0:
+            corners = self.rng.choice(corner_weights(returns), len(preferences))
+            relabelled = np.where(self.rng.random((len(preferences), 1)) < self.corner_probability, corners, relabelled)
+        return np.where(keep, preferences, relabelled).astype(np.float32)
+
+    def newest_returns(self) -> np.ndarray:
+        """Undiscounted vector returns of the episodes that ended within the last 20,000 rows, all but the oldest of each
+        environment, (n_episodes, n_objectives)."""
+        rows = np.arange(self.n_added - min(self.size(), STEPS_OF_FRONT), self.n_added) % self.buffer_size
+        sums = self.rewards[rows].astype(np.float64).cumsum(axis=0)
+        ended = self.dones[rows] == 1
+        return np.concatenate([np.diff(sums[ended[:, i], i], axis=0) for i in range(self.n_envs)])

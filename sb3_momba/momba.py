@@ -53,7 +53,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param critic_loss: "ce", distributional critics (section 3.2), or "mse", expected values
     :param vector_values: critics of the vector return (section 3.2.2) instead of the scalarised one (3.2.1)
     :param her: relabel preferences in hindsight, eq. (3.20)
-    :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0, n_relabels=1)`: see PreferenceReplayBuffer
+    :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0, n_relabels=1, corner_probability=0.0)`: the buffer's
     :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
     :param return_scaling: "maximum": by the largest return alone; "deviation": by the returns' standard deviation, down to what

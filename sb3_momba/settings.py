@@ -28,8 +28,8 @@ CHOICES = {
     "precision": PRECISIONS,
     "return_scaling": ("maximum", "deviation"),
 }
-BUFFER_ARGUMENTS = ("n_steps", "gamma", "keep_probability", "concentration", "n_relabels", "seed", "handle_timeout_termination")
-HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1}
+HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1, "corner_probability": 0.0}
+BUFFER_ARGUMENTS = ("n_steps", "gamma", *HER_DEFAULTS, "seed", "handle_timeout_termination")
 
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
 POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")

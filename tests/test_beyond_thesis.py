@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_momba import MOMBA, MombaCheckpointCallback
+from sb3_momba.envs.preferences import corner_weights
 from sb3_momba.exploration import HeldNoise, td3_smoothed
 from sb3_momba.nn.normalization import DeviationScale
 from sb3_momba.policies import SHIPPED_POLICIES
@@ -285,6 +286,50 @@ def test_several_relabels_of_each_transition():
 def test_wrong_numbers_of_relabels_are_named(n_relabels, said):
     with pytest.raises(ValueError, match=rf"n_relabels={n_relabels}.*{said}"):
         tiny_model(StubEnv(), her=True, her_kwargs={"n_relabels": n_relabels}, batch_size=8)
+
+
+def test_relabelling_toward_corner_weights():
+    """Returns (0, 10), (6, 8) and (10, 0) tie at w_1 = 1/4 and 2/3; (3, 3) is below the others everywhere."""
+    model = tiny_model(
+        StubEnv(), her=True, her_kwargs={"keep_probability": 0.0, "corner_probability": 0.5}, learning_starts=100, seed=0
+    )
+    model.learn(50)
+    buffer = model.replay_buffer
+    buffer.dones[:] = 0
+    buffer.dones[[1, 11, 21, 31, 41]] = 1
+    buffer.rewards[:50], buffer.preferences[:50] = 0, 0.5
+    buffer.rewards[[1, 2, 11, 12, 13, 30, 41], 0] = [[90, 90], [0, 7], [0, 3], [2, 8], [4, 0], [10, 0], [3, 3]]
+    assert buffer.newest_returns().tolist() == [[0, 10], [6, 8], [10, 0], [3, 3]]
+    drawn = buffer.sample(4_000).preferences[:, 0].numpy()
+    for corner in (0, 1 / 4, 2 / 3, 1):
+        assert np.isclose(drawn, corner, atol=1e-6).mean() == pytest.approx(1 / 8, abs=0.03)
+
+
+def test_before_two_episodes_have_ended_there_are_no_corners():
+    model = tiny_model(StubEnv(), her=True, her_kwargs={"corner_probability": 1.0}, learning_starts=100).learn(3)
+    assert len(model.replay_buffer.newest_returns()) == 0
+    assert len(th.unique(model.replay_buffer.sample(64).preferences[:, 0])) > 10
+
+
+def test_newest_returns_go_round_the_end_of_the_memory():
+    whole, ring = (tiny_model(StubEnv(), buffer_size=size, learning_starts=1_000, seed=0).learn(130) for size in (1_000, 50))
+    expected, returns = whole.replay_buffer.newest_returns(), ring.replay_buffer.newest_returns()
+    assert 0 < len(returns) < len(expected)
+    np.testing.assert_allclose(returns, expected[-len(returns) :])
+
+
+@pytest.mark.parametrize("n_objectives", [2, 3, 4])
+def test_at_a_corner_weight_as_many_solutions_tie_as_weights_are_positive(n_objectives):
+    values = np.random.default_rng(0).normal(size=(20, n_objectives))
+    for w in corner_weights(values):
+        utilities = np.sort(values @ w)
+        positive = int((w > 1e-9).sum())
+        np.testing.assert_allclose(utilities[-positive:], utilities[-1], atol=1e-6)
+
+
+def test_corner_weights_of_a_single_solution_are_the_corners_of_the_simplex():
+    assert corner_weights(np.array([[1.0, -2.0, 3.0]])).tolist() == [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    assert corner_weights(np.zeros((4, 2))).tolist() == [[0, 1], [1, 0]]
 
 
 # ---------------------------------------------------------------------------------------------------- return scaling

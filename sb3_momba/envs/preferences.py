@@ -14,6 +14,7 @@ from math import comb
 from typing import Any
 
 import numpy as np
+from scipy.spatial import HalfspaceIntersection
 
 from sb3_momba.finite import all_finite
 
@@ -143,6 +144,31 @@ def simplex_lattice(n_objectives: int, divisions: int) -> np.ndarray:
     bars = combinations(range(divisions + n_objectives - 1), n_objectives - 1)
     edges = np.array([[-1, *bar, divisions + n_objectives - 1] for bar in bars])
     return (np.diff(edges, axis=1) - 1) / divisions
+
+
+def corner_weights(values: np.ndarray) -> np.ndarray:
+    """The preferences at which the best of some solutions changes, the corners of the simplex among them: where new solutions
+    can gain most (linear support; Roijers, 2016; Alegre et al., 2023).
+
+    They are the corners (w, u) of the region above the utilities, u >= w.v for every v, with w on the simplex.
+
+    :param values: v of each solution, (n, n_objectives), two objectives or more
+    :return: (n_corners, n_objectives), in no order
+    """
+    n_objectives = values.shape[1]
+    size = np.abs(values).max() + 1e-12
+    # The last weight is 1 less the others. Rows (a, b) of a.x + b <= 0 with x = (w_1 ... w_{d-1}, u).
+    others = n_objectives - 1
+    scaled = values / size
+    below = np.column_stack([scaled[:, :-1] - scaled[:, -1:], -np.ones(len(scaled)), scaled[:, -1]])
+    not_negative = np.column_stack([-np.eye(others), np.zeros((others, 2))])
+    sum_at_most_1 = np.r_[np.ones(others), 0, -1]
+    top = np.r_[np.zeros(others), 1, -2]  # scaled utilities are at most 1
+    inside = np.r_[np.full(others, 1 / n_objectives), 1.5]
+    corners = HalfspaceIntersection(np.vstack([below, not_negative, sum_at_most_1, top]), inside).intersections
+    weights = corners[corners[:, -1] < 1.75, :-1]
+    weights = np.column_stack([weights, 1 - weights.sum(axis=1)]).clip(0, None)
+    return np.unique((weights / weights.sum(axis=1, keepdims=True)).round(9), axis=0)
 
 
 @lru_cache
