@@ -31,7 +31,7 @@ from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.speed import keep_freed_memory
 from sb3_momba.policy import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
-from sb3_momba.settings import HER_DEFAULTS, check_settings, parse_ent_coef, parse_target_entropy
+from sb3_momba.settings import HER_DEFAULTS, check_settings, is_number, parse_ent_coef, parse_target_entropy
 
 Self = TypeVar("Self", bound="PreferenceConditionedAlgorithm")
 
@@ -311,7 +311,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         :param log_interval: episodes between two logs
         :param reset_num_timesteps: False counts on from the steps made so far
         :raises NonFiniteLossError: if the training diverges, see `train`
+        :raises ValueError: for a number of steps below 0
         """
+        if not is_number(total_timesteps) or total_timesteps < 0:
+            raise ValueError(f"total_timesteps={total_timesteps!r}: give a number of environment steps, at least 0.")
         try:
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:

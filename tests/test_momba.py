@@ -638,3 +638,9 @@ def test_an_id_makes_the_environment():
     assert model._n_updates == 7
     assert model.predict(model.env.reset()[0, :11], preference=[0.3, 0.7])[0].shape == (3,)
     model.env.close()
+
+
+@pytest.mark.parametrize("steps", [-5, float("nan"), "1e6", True], ids=str)
+def test_wrong_numbers_of_steps_are_named(steps):
+    with pytest.raises(ValueError, match=f"total_timesteps={steps!r}: give a number"):
+        tiny_model(StubEnv()).learn(steps)
