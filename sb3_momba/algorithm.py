@@ -49,7 +49,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     vector_values: bool
     her: bool
     her_kwargs: dict[str, Any] | None
-    preference_alignment: bool
+    preference_alignment: bool | str
     preference_sampler: PreferenceSampler | SamplerSpec | None
     best_return_scale: float | None
     return_scaling: str
@@ -261,7 +261,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
         self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
-        if self.preference_alignment:
+        if self.preference_alignment is True:
             self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
 
     def _setup_learn(

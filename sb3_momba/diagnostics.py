@@ -71,7 +71,8 @@ class NegativeReturnWatch:
             self.warned = True
             warnings.warn(
                 "preference_alignment assumes returns that are not negative (section 3.5.2): the cosine of eq. (3.21) steers "
-                f"the wrong way where they are. An episode has just returned {self.returns[ended].min(axis=0).tolist()}.",
+                f"the wrong way where they are. An episode has just returned {self.returns[ended].min(axis=0).tolist()}. "
+                "preference_alignment='positive' leaves such values alone.",
                 stacklevel=2,
             )
         self.returns[ended] = 0

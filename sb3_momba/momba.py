@@ -54,7 +54,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param vector_values: critics of the vector return (section 3.2.2) instead of the scalarised one (3.2.1)
     :param her: relabel preferences in hindsight, eq. (3.20)
     :param her_kwargs: `dict(keep_probability=0.2, concentration=5.0, n_relabels=1, corner_probability=0.0)`: the buffer's
-    :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values
+    :param preference_alignment: preference alignment regularisation, eq. (3.21); needs vector_values. "positive": only where
+        w.Q is above 0, as its cosine makes a gain of any loss below
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
     :param return_scaling: "maximum": by the largest return alone; "deviation": by the returns' standard deviation, down to what
         keeps the largest at best_return_scale (SimbaV2's code; FlashSAC)
@@ -110,7 +111,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         vector_values: bool = False,
         her: bool = False,
         her_kwargs: dict[str, Any] | None = None,
-        preference_alignment: bool = False,
+        preference_alignment: bool | str = False,
         best_return_scale: float | None = 3.0,
         return_scaling: str = "maximum",
         ent_coef: str | float = "auto_0.2",
@@ -319,7 +320,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
             q_vector = q_vector.amin(dim=1, keepdim=True)
         q = self._scalarised(q_vector, batch.preferences)
         if self.preference_alignment:
-            q = q * th.cosine_similarity(q_vector, batch.preferences[:, None], dim=-1)
+            cosine = th.cosine_similarity(q_vector, batch.preferences[:, None], dim=-1)
+            q = th.where(q > 0, q * cosine, q) if self.preference_alignment == "positive" else q * cosine
         loss = (alpha * log_prob - q.min(dim=1).values).mean()
         return loss, log_prob.detach(), {"actor_loss": loss.detach(), "entropy": -log_prob.detach().mean()}
 

@@ -17,7 +17,7 @@ from sb3_momba.nn.speed import has_compiler
 from sb3_momba.policies import SHIPPED_POLICIES, MlpPolicy
 from sb3_momba.policy import MombaPolicy
 
-SWITCHES = ("vector_values", "her", "preference_alignment", "compile", "deterministic_exploration", "optimize_memory_usage")
+SWITCHES = ("vector_values", "her", "compile", "deterministic_exploration", "optimize_memory_usage")
 # The least that they may be.
 WHOLE_NUMBERS = {"batch_size": 1, "buffer_size": 1, "learning_starts": 0, "n_steps": 1, "policy_delay": 1, "noise_repeat": 1}
 RANGES = {"gamma": (0, 1), "tau": (0, 1)}
@@ -27,6 +27,7 @@ CHOICES = {
     "critic_loss_reduction": ("sum", "mean"),
     "precision": PRECISIONS,
     "return_scaling": ("maximum", "deviation"),
+    "preference_alignment": (False, True, "positive"),
 }
 HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1, "corner_probability": 0.0}
 BUFFER_ARGUMENTS = ("n_steps", "gamma", *HER_DEFAULTS, "seed", "handle_timeout_termination")
@@ -89,7 +90,7 @@ def check_settings(model: Any) -> None:
             raise ValueError(f"{name}={settings[name]!r}: it must lie in [{low}, {high}].")
     for name, known in CHOICES.items():
         if settings[name] not in known:
-            raise ValueError(f"{name}={settings[name]!r} is not known: use one of {', '.join(known)}.")
+            raise ValueError(f"{name}={settings[name]!r} is not known: use one of {', '.join(map(str, known))}.")
     rate, scale, entropy = settings["learning_rate"], settings["best_return_scale"], settings["target_entropy"]
     if not callable(rate) and not (is_number(rate) and rate >= 0):
         raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or a function of the remaining progress.")
@@ -116,7 +117,9 @@ def check_settings(model: Any) -> None:
 
 def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
     if model.preference_alignment and not model.vector_values:
-        raise ValueError("preference_alignment=True needs the vector Q of eq. (3.21): set vector_values=True.")
+        raise ValueError(
+            f"preference_alignment={model.preference_alignment} needs the vector Q of eq. (3.21): set vector_values=True."
+        )
     if model.noise_repeat > 1 and model.deterministic_exploration:
         raise ValueError(
             f"noise_repeat={model.noise_repeat} with deterministic_exploration=True: the mean action has no noise."

@@ -440,6 +440,17 @@ def test_preference_alignment_by_hand() -> None:
     assert log_prob.grad.tolist() == [0.25]
 
 
+def test_alignment_makes_a_gain_of_a_loss_unless_it_is_asked_not_to() -> None:
+    """Q = -(3, 4) is worth -25/7, and lies opposite to w: the cosine is -1, and eq. (3.21) has +25/7."""
+    for alignment, worth in ((True, 25 / 7), ("positive", -25 / 7)):
+        q = th.tensor([[[-3.0, -4.0]]], requires_grad=True)
+        model = make_model(critic_loss="mse", vector_values=True, preference_alignment=alignment)
+        loss = actor_loss(model, make_batch([[0, 0]], W_34), q[..., None], th.tensor([0.0]), alpha=0.0)
+        loss.backward()
+        assert loss.item() == pytest.approx(-worth)
+        assert bool((q.grad < 0).all()) == (alignment == "positive")  # a step against the gradient makes Q larger
+
+
 def test_without_alignment_the_lower_scalarised_value_counts() -> None:
     q = th.tensor([[[3.0, 4.0], [10.0, 0.0]]])
     model = make_model(critic_loss="mse", vector_values=True)
@@ -450,9 +461,12 @@ def test_without_alignment_the_lower_scalarised_value_counts() -> None:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     ("loss", "vector", "alignment"),
-    [*((loss, vector, False) for loss, vector in VARIANTS), ("ce", True, True), ("mse", True, True)],
+    [
+        *((loss, vector, False) for loss, vector in VARIANTS),
+        *((loss, True, how) for loss in ("ce", "mse") for how in (True, "positive")),
+    ],
 )
-def test_actor_loss_is_the_slow_loop(loss: str, vector: bool, alignment: bool, seed: int) -> None:
+def test_actor_loss_is_the_slow_loop(loss: str, vector: bool, alignment: bool | str, seed: int) -> None:
     """Eqs. (3.18) and (3.21), with Q by eqs. (3.12), (3.15) and (3.16)."""
     rng = np.random.default_rng(seed)
     model = target_model(loss, vector, n_objectives=3, preference_alignment=alignment)
@@ -467,7 +481,9 @@ def test_actor_loss_is_the_slow_loop(loss: str, vector: bool, alignment: bool, s
         for critic in outputs[b]:
             q = np.array([softmax(x) @ np.arange(5) if loss == "ce" else x[0] for x in critic])
             worth = w @ q if vector else q[0]
-            worths.append(worth * (w @ q) / np.linalg.norm(w) / np.linalg.norm(q) if alignment else worth)
+            if alignment is True or (alignment == "positive" and worth > 0):
+                worth *= (w @ q) / np.linalg.norm(w) / np.linalg.norm(q)
+            worths.append(worth)
         expected += (-min(worths) + 0.7 * log_prob[b]) / 6
     assert actual == pytest.approx(expected, rel=1e-5)
 
