@@ -12,6 +12,7 @@ import yaml
 from mo_gymnasium.wrappers.wrappers import LinearReward
 
 from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, PreferenceWrapper
+from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler, make_sampler
 from sb3_momba.nn.layers import Film, HyperDense
 from sb3_momba.nn.networks import CONDITIONINGS
@@ -247,6 +248,13 @@ def test_shipped_configurations_build_models(name: str) -> None:
     hyperparameters = with_schedules({**configuration.hyperparameters, "buffer_size": 10})
     model = MOMBA(configuration.policy, StubEnv(), device="cpu", **hyperparameters)
     assert model.policy_kwargs == configuration.hyperparameters.get("policy_kwargs", {})
+
+
+@pytest.mark.parametrize("env_id", sorted(TASKS))
+def test_momba_plus_differs_between_tasks_in_the_discount_alone(env_id: str) -> None:
+    default, entry = (read_configuration("momba_plus", name) for name in ("StubEnv-v0", env_id))
+    assert {**entry.hyperparameters, "gamma": None} == {**default.hyperparameters, "gamma": None}
+    assert entry.n_timesteps == default.n_timesteps
 
 
 def test_momba_yml_is_the_default() -> None:
