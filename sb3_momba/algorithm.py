@@ -261,7 +261,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
         self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
-        if self.preference_alignment is True:
+        if self.preference_alignment and self.preference_alignment != "positive":
             self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
 
     def _setup_learn(
@@ -311,7 +311,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         :param log_interval: episodes between two logs
         :param reset_num_timesteps: False counts on from the steps made so far
         :raises NonFiniteLossError: if the training diverges, see `train`
-        :raises ValueError: for a number of steps below 0
+        :raises ValueError: for steps that are no finite number of at least 0
         """
         if not is_number(total_timesteps) or total_timesteps < 0:
             raise ValueError(f"total_timesteps={total_timesteps!r}: give a number of environment steps, at least 0.")

@@ -15,7 +15,7 @@ from sb3_momba.envs.wrappers import LARGEST_REWARD
 from sb3_momba.finite import all_finite
 
 SMALLEST_CONCENTRATION = 1e-3
-STEPS_OF_FRONT = 20_000
+STEPS_OF_FRONT, EPISODES_OF_FRONT = 20_000, 100
 SCALARISATION_TOLERANCE = 1e-4
 STORED_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "preferences")
 
@@ -51,7 +51,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
     :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
     :param n_relabels: rows of a minibatch that come from one transition, each with a preference of its own
     :param corner_probability: share of the relabelled preferences that are drawn from the corner weights of the newest
-        episodes' returns instead of eq. (3.20) (linear support, as in GPI-LS)
+        episodes' returns instead of eq. (3.20), as soon as there are any (after linear support)
     :param seed: of the buffer's own random stream
     :param handle_timeout_termination: SB3's switch, always on: a truncated episode's last state keeps its value
     :raises ValueError: for a switch that is turned, or a number out of its range
@@ -298,17 +298,19 @@ class PreferenceReplayBuffer(ReplayBuffer):
         relabelled = self.rng.standard_gamma(parameters)
         # Gamma draws with tiny parameters can all underflow to 0: then the preference stays.
         total = relabelled.sum(axis=1, keepdims=True)
-        relabelled = relabelled / np.where(total == 0, 1, total)
-        keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None] | (total == 0)
+        relabelled = np.where(total == 0, preferences, relabelled / np.where(total == 0, 1, total))
+        keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None]
         if self.corner_probability > 0 and len(returns := self.newest_returns()) > 0:
             corners = self.rng.choice(corner_weights(returns), len(preferences))
             relabelled = np.where(self.rng.random((len(preferences), 1)) < self.corner_probability, corners, relabelled)
         return np.where(keep, preferences, relabelled).astype(np.float32)
 
     def newest_returns(self) -> np.ndarray:
-        """Undiscounted vector returns of the episodes that ended within the last 20,000 rows, all but the oldest of each
-        environment, (n_episodes, n_objectives)."""
-        rows = np.arange(self.n_added - min(self.size(), STEPS_OF_FRONT), self.n_added) % self.buffer_size
+        """Undiscounted vector returns of the newest episodes, (n_episodes, n_objectives): at most 100 that ended within the
+        last 20,000 transitions, never the oldest there of an environment. One that was cut off from outside counts as ended."""
+        n_rows = min(self.size(), STEPS_OF_FRONT // self.n_envs)
+        rows = np.arange(self.n_added - n_rows, self.n_added) % self.buffer_size
         sums = self.rewards[rows].astype(np.float64).cumsum(axis=0)
         ended = self.dones[rows] == 1
-        return np.concatenate([np.diff(sums[ended[:, i], i], axis=0) for i in range(self.n_envs)])
+        most = max(EPISODES_OF_FRONT // self.n_envs, 1)
+        return np.concatenate([np.diff(sums[ended[:, i], i], axis=0)[-most:] for i in range(self.n_envs)])

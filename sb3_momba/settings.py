@@ -27,7 +27,6 @@ CHOICES = {
     "critic_loss_reduction": ("sum", "mean"),
     "precision": PRECISIONS,
     "return_scaling": ("maximum", "deviation"),
-    "preference_alignment": (False, True, "positive"),
 }
 HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1, "corner_probability": 0.0}
 BUFFER_ARGUMENTS = ("n_steps", "gamma", *HER_DEFAULTS, "seed", "handle_timeout_termination")
@@ -79,6 +78,8 @@ def check_settings(model: Any) -> None:
     check_other_arguments({name: settings[name] for name in OF_SAC if name in settings}, OF_SAC)
     for name in SWITCHES:
         check_switch(name, settings[name])
+    if settings["preference_alignment"] != "positive":
+        check_switch("preference_alignment", settings["preference_alignment"], ', or "positive"')
     for name, least in WHOLE_NUMBERS.items():
         check_whole(name, settings[name], least)
     if settings["reset_interval"] is not None:
@@ -90,7 +91,7 @@ def check_settings(model: Any) -> None:
             raise ValueError(f"{name}={settings[name]!r}: it must lie in [{low}, {high}].")
     for name, known in CHOICES.items():
         if settings[name] not in known:
-            raise ValueError(f"{name}={settings[name]!r} is not known: use one of {', '.join(map(str, known))}.")
+            raise ValueError(f"{name}={settings[name]!r} is not known: use one of {', '.join(known)}.")
     rate, scale, entropy = settings["learning_rate"], settings["best_return_scale"], settings["target_entropy"]
     if not callable(rate) and not (is_number(rate) and rate >= 0):
         raise ValueError(f"learning_rate={rate!r}: give a number of at least 0, or a function of the remaining progress.")
@@ -168,8 +169,10 @@ def _check_relabels(relabelling: Mapping[str, Any], batch_size: int) -> None:
     check_whole("n_relabels", n, 1)
     if batch_size % n != 0:
         raise ValueError(f"n_relabels={n} does not divide batch_size={batch_size}.")
-    if n > 1 and relabelling.get("keep_probability", 1) == 1:
-        raise ValueError(f"n_relabels={n}, where no preference is relabelled: set her=True, and keep_probability below 1.")
+    for name, nothing in (("n_relabels", 1), ("corner_probability", 0.0)):
+        value = relabelling.get(name, nothing)
+        if value != nothing and relabelling.get("keep_probability", 1) == 1:
+            raise ValueError(f"{name}={value}, where no preference is relabelled: set her=True, and keep_probability below 1.")
 
 
 def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
@@ -252,9 +255,9 @@ def parse_target_entropy(target_entropy: str | float, action_dim: int) -> float:
     return action_dim / 2 * math.log(2 * math.pi * math.e * deviation**2)
 
 
-def check_switch(name: str, value: Any) -> None:
+def check_switch(name: str, value: Any, otherwise: str = "") -> None:
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name}={value!r}: it is a switch, give True or False.")
+        raise ValueError(f"{name}={value!r}: it is a switch, give True or False{otherwise}.")
 
 
 def check_whole(name: str, value: Any, least: int, otherwise: str = "") -> None:

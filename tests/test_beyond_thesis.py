@@ -7,13 +7,13 @@ import pytest
 import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_momba import MOMBA, MombaCheckpointCallback
+from sb3_momba import MOMBA, MombaCheckpointCallback, buffers, make_mo_vec_env
 from sb3_momba.envs.preferences import corner_weights
 from sb3_momba.exploration import HeldNoise, td3_smoothed
 from sb3_momba.nn.normalization import DeviationScale
 from sb3_momba.policies import SHIPPED_POLICIES
 from sb3_momba.settings import parse_target_entropy
-from tests.stubs import StubEnv, tiny_model
+from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
 
 
 def parameters_of(network: th.nn.Module) -> list[th.Tensor]:
@@ -243,6 +243,7 @@ def test_td3_has_no_entropy_in_its_targets():
         ({"noise_repeat": 2, "deterministic_exploration": True}, "noise_repeat=2 with deterministic_exploration"),
         ({"ent_coef": 0.1, "ent_coef_learning_rate": 1e-3}, "ent_coef_learning_rate=0.001 with ent_coef=0.1, which is fixed"),
         ({"replay_buffer_kwargs": {"n_relabels": 2}}, "n_relabels=2, where no preference is relabelled"),
+        ({"replay_buffer_kwargs": {"corner_probability": 0.5}}, "corner_probability=0.5, where no preference is relabelled"),
         ({"her": True, "her_kwargs": {"n_relabels": 2, "keep_probability": 1.0}}, "n_relabels=2, where no"),
         ({"her": True, "replay_buffer_kwargs": {"n_relabels": 3}, "batch_size": 8}, "does not divide batch_size=8"),
     ],
@@ -253,6 +254,7 @@ def test_td3_has_no_entropy_in_its_targets():
         "noise of the mean",
         "rate of a fixed alpha",
         "relabels without HER",
+        "corners without HER",
         "relabels that all keep",
         "rows",
     ],
@@ -318,10 +320,42 @@ def test_newest_returns_go_round_the_end_of_the_memory():
     np.testing.assert_allclose(returns, expected[-len(returns) :])
 
 
+def test_newest_returns_are_of_each_environment_and_of_the_newest_transitions(monkeypatch):
+    model = MOMBA(
+        "SimbaPolicy",
+        make_mo_vec_env(StubEnv, 3),
+        buffer_size=300,
+        learning_starts=1_000,
+        policy_kwargs=TINY_SIMBA,
+        device="cpu",
+    ).learn(60)
+    buffer = model.replay_buffer
+    buffer.rewards[:20], buffer.dones[:20] = 1, 0
+    buffer.dones[[3, 9, 14], 0] = buffer.dones[[7, 19], 2] = 1  # in the second environment no episode ends
+    assert buffer.newest_returns().tolist() == [[6, 6], [5, 5], [12, 12]]
+    monkeypatch.setattr(buffers, "EPISODES_OF_FRONT", 3)
+    assert buffer.newest_returns().tolist() == [[5, 5], [12, 12]]
+    monkeypatch.setattr(buffers, "STEPS_OF_FRONT", 3 * 12)  # the rows from 8 on
+    assert buffer.newest_returns().tolist() == [[5, 5]]
+
+
+def test_nearly_equal_solutions_have_the_corners_of_one():
+    values = 5 + 1e-13 * np.random.default_rng(0).normal(size=(18, 4))
+    assert sorted(corner_weights(values).tolist()) == np.eye(4)[::-1].tolist()
+
+
+@pytest.mark.parametrize("values", [np.ones((3, 1)), np.ones((0, 2)), np.array([[1.0, np.nan]])], ids=["one", "none", "NaN"])
+def test_values_without_corners_are_refused(values):
+    with pytest.raises(ValueError, match="give finite ones of one solution or more, two objectives or more"):
+        corner_weights(values)
+
+
 @pytest.mark.parametrize("n_objectives", [2, 3, 4])
 def test_at_a_corner_weight_as_many_solutions_tie_as_weights_are_positive(n_objectives):
     values = np.random.default_rng(0).normal(size=(20, n_objectives))
-    for w in corner_weights(values):
+    corners = corner_weights(values)
+    assert {tuple(corner) for corner in np.eye(n_objectives)} < {tuple(w) for w in corners.tolist()}
+    for w in corners:
         utilities = np.sort(values @ w)
         positive = int((w > 1e-9).sum())
         np.testing.assert_allclose(utilities[-positive:], utilities[-1], atol=1e-6)

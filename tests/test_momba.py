@@ -210,6 +210,8 @@ def test_switches_do_what_they_say():
         ({"critic_loss": "huber"}, r"critic_loss='huber' is not known: use one of ce, mse"),
         ({"preference_alignment": True}, r"preference_alignment=True .*set vector_values=True"),
         ({"her_kwargs": {"concentration": 1.0}}, r"her_kwargs=.*without her=True"),
+        ({"her": True, "her_kwargs": {"corner_probability": 1.5}}, r"corner_probability=1\.5.*a probability"),
+        ({"vector_values": True, "preference_alignment": 1}, 'preference_alignment=1: .*True or False, or "positive"'),
         ({"her": True, "her_kwargs": {"keep_probability": 2.0}}, r"keep_probability=2\.0.*a probability"),
         ({"her": True, "her_kwargs": {"concentration": 0.0}}, r"concentration=0\.0.*positive"),
         ({"n_steps": 0}, r"n_steps=0: it must be a whole number of at least 1"),

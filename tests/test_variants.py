@@ -403,7 +403,9 @@ def test_a_run_does_not_overwrite_another(tmp_path) -> None:
         main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path)])
 
 
-@pytest.mark.parametrize(("sign", "alignment", "warns"), [(1, True, False), (-1, True, True), (-1, "positive", False)])
+@pytest.mark.parametrize(
+    ("sign", "alignment", "warns"), [(1, True, False), (-1, True, True), (-1, np.True_, True), (-1, "positive", False)]
+)
 def test_preference_alignment_warns_once_of_negative_returns(sign: int, alignment: bool | str, warns: bool, recwarn) -> None:
     rewards = {t: np.array([1.0, sign * 2.0]) for t in range(1, 31)}
     kwargs = {"buffer_size": 50, "learning_starts": 50, "policy_kwargs": TINY_SIMBA}

@@ -152,14 +152,17 @@ def corner_weights(values: np.ndarray) -> np.ndarray:
 
     They are the corners (w, u) of the region above the utilities, u >= w.v for every v, with w on the simplex.
 
-    :param values: v of each solution, (n, n_objectives), two objectives or more
+    :param values: v of each solution, (n, n_objectives), in any unit
     :return: (n_corners, n_objectives), in no order
+    :raises ValueError: for fewer than two objectives, no solution, or values that are not finite
     """
+    if values.ndim != 2 or values.shape[0] < 1 or values.shape[1] < 2 or not all_finite(values):
+        raise ValueError(f"values of shape {values.shape}: give finite ones of one solution or more, two objectives or more.")
     n_objectives = values.shape[1]
     size = np.abs(values).max() + 1e-12
     # The last weight is 1 less the others. Rows (a, b) of a.x + b <= 0 with x = (w_1 ... w_{d-1}, u).
     others = n_objectives - 1
-    scaled = values / size
+    scaled = np.unique((values / size).round(9), axis=0)  # Qhull stumbles over solutions that are nearly the same.
     below = np.column_stack([scaled[:, :-1] - scaled[:, -1:], -np.ones(len(scaled)), scaled[:, -1]])
     not_negative = np.column_stack([-np.eye(others), np.zeros((others, 2))])
     sum_at_most_1 = np.r_[np.ones(others), 0, -1]
