@@ -251,9 +251,10 @@ def test_shipped_configurations_build_models(name: str) -> None:
 
 
 @pytest.mark.parametrize("env_id", sorted(TASKS))
-def test_momba_plus_differs_between_tasks_in_the_discount_alone(env_id: str) -> None:
+def test_momba_plus_differs_between_tasks_in_the_horizon_alone(env_id: str) -> None:
     default, entry = (read_configuration("momba_plus", name) for name in ("StubEnv-v0", env_id))
-    assert {**entry.hyperparameters, "gamma": None} == {**default.hyperparameters, "gamma": None}
+    of_the_horizon = dict.fromkeys(("gamma", "n_steps", "tau", "noise_repeat"))
+    assert {**entry.hyperparameters, **of_the_horizon} == {**default.hyperparameters, **of_the_horizon}
     assert entry.n_timesteps == default.n_timesteps
 
 
