@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence comparison reduced rounding sweep-throughput speed torture compat docs linkcheck clean
+.PHONY: demo test browser lint known-fronts first-records evidence comparison beyond reduced rounding sweep-throughput speed torture compat docs linkcheck clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -61,6 +61,12 @@ comparison: $(VENV)/tools
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf dpmorl $(OWN) --steps 1e6 --eval-freq 1e5 \
 		--label "dpmorl, 1M" --output runs/million/dpmorl
 	$(BIN)/python -m sb3_momba.benchmark report runs/million
+
+# Beyond the thesis: an hour of one core.
+beyond: $(VENV)/installed
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf momba_plus --env MO-Swimmer-v4 --seeds 3 --steps 3e4 --eval-freq 5e3 \
+		--set precision=auto --set compile=true --output runs/beyond
+	$(BIN)/python -m sb3_momba.benchmark report runs/beyond
 
 # The ablations of chapter 4 in short, on one task: about twelve hours of one core.
 reduced: $(VENV)/installed
