@@ -13,7 +13,7 @@ RESULTS = ROOT / "docs" / "results"
 COMMANDS = {"report.md": "report", "chapter4.md": "chapter4"}
 REPORTS = sorted(path for name in COMMANDS for path in RESULTS.rglob(name))
 # What a report takes before the records beside it.
-BEFORE = {"comparison": ["evidence"]}
+BEFORE = {"comparison": ["evidence"], "beyond": ["evidence"]}
 PINNED = re.search(r"^matplotlib==([\d.]+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
 
 
