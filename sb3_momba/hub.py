@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike
 from sb3_momba import MOMBA, ParetoFront, __version__, plot_front
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.metrics import summarise
+from sb3_momba.recording import plain
 from sb3_momba.records import FILE_NAME as RECORD_NAME
-from sb3_momba.records import Record, plain, read_record
+from sb3_momba.records import Record, read_record
 from sb3_momba.saving import read_model
 from sb3_momba.system import library_versions
 from sb3_momba.train import command_of

@@ -28,8 +28,9 @@ from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
 from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.floors import evaluate_floors
 from sb3_momba.pareto.metrics import summarise
+from sb3_momba.recording import RecordWriter, plain
 from sb3_momba.records import FILE_NAME as RECORD_NAME
-from sb3_momba.records import RecordWriter, plain, read_record
+from sb3_momba.records import read_record
 from sb3_momba.settings import check_whole
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults, with_schedules
 

@@ -18,7 +18,7 @@ import yaml
 
 from sb3_momba.envs.workers import WorkerError
 from sb3_momba.pareto import protocol
-from sb3_momba.records import plain
+from sb3_momba.recording import plain
 from sb3_momba.runs import RunResult, RunSettings, resume, run
 from sb3_momba.zoo.configuration import (
     N_TIMESTEPS,

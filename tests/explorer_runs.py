@@ -19,7 +19,7 @@ from sb3_momba.explorer.kit import DecisionKit
 from sb3_momba.explorer.live import LiveServer, listen
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.metrics import summarise
-from sb3_momba.records import RecordWriter
+from sb3_momba.recording import RecordWriter
 from sb3_momba.runs import RunSettings, run
 
 TINY = {"net_arch": [8], "n_atoms": 11}

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sb3_momba
-from sb3_momba import records
+from sb3_momba import recording
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.chapter4 import layout
 from sb3_momba.benchmark.chapter4.command import write_chapter
@@ -44,7 +44,8 @@ from sb3_momba.benchmark.chapter4.tables import table_4_2, table_4_3, table_4_4,
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
 from sb3_momba.benchmark.report import write_report
 from sb3_momba.benchmark.results import compare, curve_on
-from sb3_momba.records import Record, plain
+from sb3_momba.recording import plain
+from sb3_momba.records import Record
 from sb3_momba.zoo.configuration import read_configuration, shipped_configurations, with_defaults
 from tests.stubs import tiny_model
 from tests.test_benchmark import BAD, FRONT, PNG, box, hyperparameters, write_record
@@ -58,7 +59,7 @@ BASELINES = {"pgmorl", "gpi_ls", "gpi_ls_utd_1", "dpmorl", "dpmorl_state", "fixe
 def no_revision(monkeypatch) -> None:
     """Fake records ask neither git nor the machine."""
     for what in ("git_revision", "library_versions", "machine"):
-        monkeypatch.setattr(records, what, lambda: None)
+        monkeypatch.setattr(recording, what, lambda: None)
 
 
 @pytest.fixture

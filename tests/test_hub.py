@@ -19,7 +19,8 @@ from huggingface_hub import HfApi, hf_hub_download
 
 from sb3_momba import MOMBA, ParetoFront, evaluate_front, hub
 from sb3_momba.files import FileFormatError
-from sb3_momba.records import RecordWriter, read_record
+from sb3_momba.recording import RecordWriter
+from sb3_momba.records import read_record
 from sb3_momba.runs import RunSettings, recorded_settings, run
 from sb3_momba.train import command_of, parse
 from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv, tiny_model

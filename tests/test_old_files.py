@@ -15,7 +15,8 @@ import pytest
 from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoFront, evaluate_front
 from sb3_momba.checkpoints.folders import MANIFEST, checkpoints_in, newest, sealed
 from sb3_momba.files import FileFormatError, read_tree, write_tree
-from sb3_momba.records import RecordWriter, read_record
+from sb3_momba.recording import RecordWriter
+from sb3_momba.records import read_record
 from tests.stubs import StubEnv, tiny_model
 
 FOLDER = Path(__file__).parent / "files_of_version_1"

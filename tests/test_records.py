@@ -24,7 +24,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, records, system
+from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, recording, system
 from sb3_momba.envs.making import make_mo_vec_env
 from sb3_momba.envs.preferences import ConeSampler, preference_grid
 from sb3_momba.files import FileFormatError
@@ -34,7 +34,8 @@ from sb3_momba.pareto.evaluation import evaluate_front
 from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy, evaluate_floors
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
-from sb3_momba.records import UNENDED, Record, RecordWriter, find_records, is_cut_off_at_its_start, plain, read_record
+from sb3_momba.recording import RecordWriter, plain
+from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
 from sb3_momba.runs import NOT_RECORDED, RunSettings, recorded_settings, run
 from sb3_momba.train import command_of, main, parse
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
@@ -103,7 +104,7 @@ def front_of(values: Any) -> dict[str, Any]:
 @pytest.fixture(autouse=True)
 def no_revision(monkeypatch) -> None:
     """git is asked for the real run, which comes first, and in its own test."""
-    monkeypatch.setattr(records, "git_revision", lambda: None)
+    monkeypatch.setattr(recording, "git_revision", lambda: None)
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import CLOCKS
 from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
 from sb3_momba.pareto.metrics import hypervolume, summarise
-from sb3_momba.records import FILE_NAME, RecordWriter, plain
+from sb3_momba.recording import RecordWriter, plain
+from sb3_momba.records import FILE_NAME
 from sb3_momba.runs import append_floors, check_empty, description
 from sb3_momba.settings import check_whole, nearest
 

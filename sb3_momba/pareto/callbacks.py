@@ -21,7 +21,7 @@ from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_
 from sb3_momba.pareto.metrics import hypervolume
 from sb3_momba.pareto.plotting import plot_front
 from sb3_momba.pareto.protocol import N_EPISODES, N_PREFERENCES
-from sb3_momba.records import RecordWriter
+from sb3_momba.recording import RecordWriter
 
 STATE = (
     *("next_evaluation", "go_on", "is_evaluated", "timesteps", "metrics", "values", "evaluation_seconds"),

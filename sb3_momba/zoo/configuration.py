@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_momba.envs.registry import PREFIX, raw_id
 from sb3_momba.momba import MOMBA
 from sb3_momba.policy import MombaPolicy
-from sb3_momba.records import plain
+from sb3_momba.recording import plain
 from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parameters, policy_parameters
 
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"

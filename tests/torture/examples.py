@@ -11,7 +11,8 @@ import numpy as np
 from sb3_momba import MOMBA, MombaCheckpointCallback, SimbaPolicy, make_mo_vec_env
 from sb3_momba.checkpoints.folders import MANIFEST, checkpoints_in, newest
 from sb3_momba.pareto.evaluation import ParetoFront
-from sb3_momba.records import RecordWriter, read_record
+from sb3_momba.recording import RecordWriter
+from sb3_momba.records import read_record
 from sb3_momba.zoo.configuration import SHIPPED, read_configuration
 from tests.torture.trainings import SAVE_FREQ, TASK, new_model
 

@@ -12,7 +12,8 @@ from sb3_momba.benchmark.results import Run, Task, flat, setting_text
 from sb3_momba.benchmark.tables import markdown
 from sb3_momba.envs.registry import raw_id
 from sb3_momba.pareto import protocol
-from sb3_momba.records import Record, plain
+from sb3_momba.recording import plain
+from sb3_momba.records import Record
 from sb3_momba.zoo.configuration import N_TIMESTEPS, read_configuration, shipped_configurations, with_defaults
 
 MISSING = "missing"
