@@ -28,7 +28,7 @@ from sb3_momba.benchmark.execution import has_to_run
 from sb3_momba.benchmark.grid import Cell, make_cells
 from sb3_momba.benchmark.local import run_grid
 from sb3_momba.benchmark.report import write_report
-from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on, median_run
+from sb3_momba.benchmark.results import Run, Task, areas_under_curve, compare, curve_on, cut_at, median_run
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.benchmark.tables import as_text
 from sb3_momba.files import FileFormatError, alone_in
@@ -617,6 +617,53 @@ def test_who_evaluates_rarely_gains_nothing_over_time(fake) -> None:
     made = [fake(box(3.0), {10: box(2.0), 20: box(3.0)}), fake(box(3.0), {20: box(3.0)}, label="b")]
     often, rarely = (runs[0] for runs in only(compare(made)).methods.values())
     assert (often.mean_over_time, rarely.mean_over_time) == (2, 2)
+
+
+def long(**changed: Any) -> dict[str, Any]:
+    """Settings of a run of 30 steps."""
+    return {"steps": 30, "hyperparameters": {"learning_rate": 1e-4, **changed}}
+
+
+def test_a_longer_run_counts_as_it_stood_at_the_common_step(fake) -> None:
+    """Beside one that was asked for 20 steps it is scored, drawn and named as one of 20, its own later steps forgotten."""
+    short = fake(box(4.0), {10: box(2.0), 20: box(4.0)}, settings={**long(), "steps": 20})
+    whole = fake(box(9.0), {10: box(3.0), 20: box(5.0), 30: box(9.0)}, settings=long(), seed=1)
+    runs = only(compare(cut_at(record, 20) for record in (short, whole))).methods["a"]
+    assert [run.hypervolume for run in runs] == [4, 5]
+    assert [run.mean_over_steps for run in runs] == [3, 4]
+    assert all(run.record.config["steps"] == 20 and run.steps[-1] == 20 for run in runs)
+    assert cut_at(short, 20) is short
+
+
+def test_a_run_that_failed_later_had_finished_its_first_steps(fake) -> None:
+    curve = {10: box(2.0), 20: box(4.0)}
+    failed = fake(None, curve, BAD, settings=long())
+    assert (cut_at(failed, 20).error, cut_at(failed, 20).traceback) == (None, "")
+    np.testing.assert_array_equal(cut_at(failed, 20).final_values, box(4.0))
+    before = cut_at(failed, 25)
+    assert before.error == failed.error
+    assert before.final_values is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "general_policy", "message"),
+    [
+        (long(), True, "cannot be cut at 15 steps: it was evaluated at 10, 20"),
+        (long(learning_rate="lin_3e-4_0"), True, "its learning rate, lin_3e-4_0, depends on how many it was asked for, 30"),
+        (long(), False, "what it trains depends on how many it was asked for, 30"),
+    ],
+)
+def test_runs_that_cannot_be_cut_are_named(fake, settings: dict[str, Any], general_policy: bool, message: str) -> None:
+    record = fake(FRONT, {10: FRONT, 20: FRONT}, settings=settings, general_policy=general_policy)
+    with pytest.raises(ValueError, match=f"{re.escape(str(record.path))}.*{message}"):
+        cut_at(record, 15)
+
+
+def test_a_report_at_equal_steps(fake, tmp_path, capsys) -> None:
+    record = fake(box(9.0), {10: box(3.0), 20: box(5.0), 30: box(9.0)}, settings=long())
+    main(["report", str(record.path), "--steps", "2e1", "--output", str(tmp_path / "cut")])
+    (row,) = [line.split("|")[1:6] for line in capsys.readouterr().out.splitlines() if line.startswith("| a ")]
+    assert [cell.strip() for cell in row] == ["a", "1/1", "20", "210", "5"]
 
 
 def test_a_curve_that_stops_short_of_a_common_step_ends_there(fake) -> None:
@@ -1435,6 +1482,8 @@ def test_an_interrupted_grid_begins_nothing_more(tmp_path, monkeypatch, capsys) 
 
     def interrupted(command: Any, **kwargs: Any) -> None:
         begun.append(command)
+        if len(begun) > 1:
+            time.sleep(1)  # A run takes its time: by then the grid has heard of the first one.
         raise KeyboardInterrupt
 
     monkeypatch.setattr(subprocess, "run", interrupted)
@@ -1482,8 +1531,6 @@ def test_speed_measures_the_parts_that_are_asked_for(capsys):
 
 
 def test_speed_counts_products_and_parameters():
-        if len(begun) > 1:
-            time.sleep(1)  # A run takes its time: by then the grid has heard of the first one.
     model = speed.filled_model(policy_kwargs=TINY_SIMBA)
     assert speed.products_of_an_update(model) > 0
     seconds, parameters = speed.cost_of_update({"policy_kwargs": TINY_SIMBA})

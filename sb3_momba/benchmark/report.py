@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from sb3_momba.benchmark.results import Run, Task, compare, curve_on, median_run, parameters_of
+from sb3_momba.benchmark.results import Run, Task, compare, curve_on, cut_at, median_run, parameters_of
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.plotting import COLOURS, default_style, plot_front, verbatim
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
+from sb3_momba.train import whole_number
 
 CURVE_REPETITIONS = 2_000
 COLUMNS = {
@@ -256,10 +257,25 @@ def draw_fronts(task: Task, path: Path) -> bool:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("records", nargs="+", type=Path, help="record files, or folders that hold some")
+    add_records(parser)
     parser.add_argument("--output", type=Path, help="folder of report.md and its pictures; by default the first of RECORDS")
     parser.add_argument("--baseline", help="the method in whose units scores are aggregated over tasks")
     parser.add_argument("--reference-point", type=float, nargs="+", help="of the hypervolume, instead of the records' own")
+
+
+def add_records(parser: argparse.ArgumentParser) -> None:
+    """The records that a command reads; see `records_of`."""
+    parser.add_argument("records", nargs="+", type=Path, help="record files, or folders that hold some")
+    parser.add_argument("--steps", type=whole_number, help="compare at so many steps: longer runs as they stood there")
+
+
+def records_of(given: argparse.Namespace) -> list[Record]:
+    """What the command line asks for; says which records hold nothing yet.
+
+    :raises ValueError: if none holds anything, or one cannot be cut where it is asked for
+    """
+    records = read_begun(given.records)
+    return records if given.steps is None else [cut_at(record, given.steps) for record in records]
 
 
 def read_begun(given: Sequence[Path]) -> list[Record]:
@@ -278,7 +294,7 @@ def read_begun(given: Sequence[Path]) -> list[Record]:
 
 
 def main(given: argparse.Namespace) -> None:
-    records = read_begun(given.records)
+    records = records_of(given)
     first = given.records[0]
     folder = given.output or (first if first.is_dir() else first.parent)
     print(write_report(compare(records, given.reference_point), records, folder, given.baseline))

@@ -134,6 +134,31 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
     return Task(name, reference, front, floors, methods, seconds, fixed)
 
 
+def cut_at(record: Record, steps: int) -> Record:
+    """A run as it stood at `steps`, which is as if it had been asked for no more: its evaluation there is the final one.
+
+    A run that was asked for no more is as it is.
+
+    :raises ValueError: for a longer one that was not evaluated there, or that would have gone otherwise with fewer steps
+    """
+    planned = record.config.get("steps", record.evaluations[-1].steps if record.evaluations else 0)
+    if planned <= steps:
+        return record
+    cannot = f"{record.path} cannot be cut at {steps:,} steps"
+    rate = record.config.get("hyperparameters", {}).get("learning_rate", 0.0)
+    if not record.general_policy or not isinstance(rate, int | float):
+        what = "what it trains" if not record.general_policy else f"its learning rate, {rate},"
+        raise ValueError(f"{cannot}: {what} depends on how many it was asked for, {planned:,.0f}.")
+    before = [evaluation for evaluation in record.evaluations if evaluation.steps <= steps]
+    cut = replace(record, config={**record.config, "steps": steps}, evaluations=before)
+    if before and before[-1].steps == steps:
+        last = before[-1]
+        return replace(cut, final_values=last.values, extra_steps=last.extra_steps, error=None, traceback="")
+    if record.error is not None and before == record.evaluations:
+        return cut  # It did not get so far.
+    raise ValueError(f"{cannot}: it was evaluated at {', '.join(f'{one.steps:,}' for one in record.evaluations)}.")
+
+
 def is_fixed_preference(record: Record) -> bool:
     return record.label == FIXED_PREFERENCE and len(record.preferences) == 1
 
