@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from sb3_momba.benchmark.chapter4.scores import Aggregate, Curve
+from sb3_momba.benchmark.chapter4.scores import Aggregate
+from sb3_momba.benchmark.curves import Curve, draw_curve
 from sb3_momba.benchmark.statistics import Estimate
 from sb3_momba.files import atomic_write
 from sb3_momba.pareto.plotting import COLOURS, MARKERS, default_style, label_axes, scatter_front, verbatim
@@ -60,19 +61,16 @@ def draw_fronts(panels: Sequence[FrontPanel], path: Path) -> bool:
     return True
 
 
-def draw_curves(panels: Sequence[CurvePanel], path: Path, columns: int | None = None) -> bool:
-    """Scores over steps with their intervals; levels are horizontal.
-
-    :param columns: of panels; by default as many as look well
-    """
+def draw_curves(panels: Sequence[CurvePanel], path: Path) -> bool:
+    """Scores over steps with their intervals; levels are horizontal."""
     shown = [panel for panel in panels if any(curve is not None for curve in panel.curves.values())]
     if not shown:
         return False
     with default_style():
-        n_columns, n_rows = layout(len(shown)) if columns is None else (columns, -(-len(shown) // columns))
-        figure = Figure(figsize=(4 * n_columns, 3 * n_rows + 0.6), layout="constrained")
+        columns, rows = layout(len(shown))
+        figure = Figure(figsize=(4 * columns, 3 * rows + 0.6), layout="constrained")
         for place, panel in enumerate(shown, start=1):
-            axes = figure.add_subplot(n_rows, n_columns, place)
+            axes = figure.add_subplot(rows, columns, place)
             for style, (name, curve) in enumerate(panel.curves.items()):
                 if curve is not None:
                     draw_curve(axes, curve, name, style)
@@ -84,14 +82,6 @@ def draw_curves(panels: Sequence[CurvePanel], path: Path, columns: int | None = 
             axes.grid(alpha=0.3)
         write(figure, path)
     return True
-
-
-def draw_curve(axes: Axes, curve: Curve, name: str, style: int) -> None:
-    colour = COLOURS[style % len(COLOURS)]
-    marker = MARKERS[style % len(MARKERS)] if len(curve.steps) == 1 else None
-    axes.plot(curve.steps, [point.value for point in curve.points], color=colour, marker=marker, label=verbatim(name))
-    low, high = [point.low for point in curve.points], [point.high for point in curve.points]
-    axes.fill_between(curve.steps, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
 def draw_estimates(panels: Mapping[str, Mapping[str, Aggregate]], path: Path) -> bool:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sb3_momba.benchmark.chapter4.layout import MOMBA, NONE, PGMORL, Labels, Methods
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
-from sb3_momba.benchmark.report import CURVE_REPETITIONS
+from sb3_momba.benchmark.curves import Curve, curve_through
 from sb3_momba.benchmark.results import (
     Metric,
     Run,
@@ -59,14 +59,6 @@ class Aggregate:
     finished: int
     runs: int
     tasks: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A score over environment steps, (n,) each."""
-
-    steps: Array
-    points: list[Estimate]
 
 
 def tasks_of(records: Iterable[Record]) -> dict[str, Task]:
@@ -216,12 +208,6 @@ def aggregate_curve(tasks: Tasks, labels: Labels, metric: Metric, unit: Mapping[
     every = np.unique(np.concatenate([np.array([end]), *(steps for steps, _ in on_tasks)]))
     common = every[(begin <= every) & (every <= end)]
     return curve_through(common, [np.array([np.interp(common, steps, run) for run in runs]) for steps, runs in on_tasks])
-
-
-def curve_through(steps: Array, tasks: Sequence[Array]) -> Curve:
-    """:param tasks: the runs of each, (n_runs, n)"""
-    columns = [[curves[:, i] for curves in tasks] for i in range(len(steps))]
-    return Curve(steps, [estimate(interquartile_mean, column, repetitions=CURVE_REPETITIONS) for column in columns])
 
 
 def critic_parameters(tasks: Tasks, labels: Labels) -> float | None:
