@@ -67,7 +67,8 @@ class Evaluation:
 @dataclass(frozen=True)
 class Record:
     """A record as it was read. `error` is None for a run that finished; one without an end counts as failed. `traceback` is
-    empty where none was recorded. `extra_steps` are those of episodes that the method played for itself, beside its steps."""
+    empty where none was recorded. `extra_steps` are those of episodes that the method played for itself, beside its steps. Of a
+    run that is looked at as it stood before its end, `whole` is the record to its end."""
 
     path: Path
     label: str
@@ -86,12 +87,21 @@ class Record:
     error: str | None
     traceback: str = ""
     extra_steps: int = 0
+    whole: "Record | None" = None
 
     @property
     def task(self) -> str:
         """The environment, `momba/` or raw, with the arguments that it was made with."""
         arguments = ", ".join(f"{name}={value}" for name, value in sorted(self.env_kwargs.items()))
         return f"{raw_id(self.env)} ({arguments})" if arguments else raw_id(self.env)
+
+    @property
+    def planned_steps(self) -> int:
+        """That the run was asked for or, where it does not say, had."""
+        planned = self.config.get("steps")
+        if isinstance(planned, int | float):
+            return int(planned)
+        return self.evaluations[-1].steps if self.evaluations else 0
 
 
 def find_records(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:

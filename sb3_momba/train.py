@@ -152,9 +152,12 @@ def add_protocol_arguments(parser: argparse._ActionsContainer) -> None:
 
 def whole_number(text: str) -> int:
     """An integer that may be written 1e6."""
-    number = float(text)
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
     if not number.is_integer():
-        raise ValueError(f"{text} is no whole number")
+        raise argparse.ArgumentTypeError(f"{text} is no whole number")
     return int(number)
 
 

@@ -612,6 +612,17 @@ def test_curves_by_hand(fake) -> None:
     np.testing.assert_allclose(areas_under_curve(runs), [4, 2, 3, 0])
 
 
+def test_a_run_that_failed_early_has_nothing_for_the_rest(fake) -> None:
+    """Two volumes of 10, one of them lost after a tenth of the time; and after a tenth of the steps, where no run went on."""
+    curve = {100: box(10.0), 1000: box(10.0)}
+    whole = fake(box(10.0), curve, settings={"steps": 1000})
+    early = [fake(None, {100: box(10.0)}, BAD, settings={"steps": 1000}, label="b", seed=seed) for seed in range(2)]
+    methods = only(compare([whole, *early])).methods
+    assert [run.mean_over_time for run in methods["a"]] == pytest.approx([0.1 * (1 + 10) / 2 + 9])
+    assert [run.mean_over_time for run in methods["b"]] == pytest.approx([0.1 * (1 + 10) / 2] * 2)
+    assert [run.mean_over_steps for run in methods["b"]] == pytest.approx([0, 0], abs=0.01)
+
+
 def test_who_evaluates_rarely_gains_nothing_over_time(fake) -> None:
     """From standing still, 1, both rise by one a second."""
     made = [fake(box(3.0), {10: box(2.0), 20: box(3.0)}), fake(box(3.0), {20: box(3.0)}, label="b")]
@@ -635,6 +646,13 @@ def test_a_longer_run_counts_as_it_stood_at_the_common_step(fake) -> None:
     assert cut_at(short, 20) is short
 
 
+def test_how_often_a_run_was_evaluated_makes_no_other_method(fake) -> None:
+    often = fake(box(4.0), {10: box(2.0), 20: box(4.0)}, settings={**long(), "steps": 20, "eval_freq": 10})
+    rarely = fake(box(9.0), {20: box(6.0), 40: box(9.0)}, settings={**long(), "steps": 40, "eval_freq": 20}, seed=1)
+    runs = only(compare(cut_at(record, 20) for record in (often, rarely))).methods["a"]
+    assert [run.hypervolume for run in runs] == [4, 6]
+
+
 def test_a_run_that_failed_later_had_finished_its_first_steps(fake) -> None:
     curve = {10: box(2.0), 20: box(4.0)}
     failed = fake(None, curve, BAD, settings=long())
@@ -648,7 +666,7 @@ def test_a_run_that_failed_later_had_finished_its_first_steps(fake) -> None:
 @pytest.mark.parametrize(
     ("settings", "general_policy", "message"),
     [
-        (long(), True, "cannot be cut at 15 steps: it was evaluated at 10, 20"),
+        (long(), True, "cannot be cut at 15 steps, leave it out: it was evaluated at 10, 20"),
         (long(learning_rate="lin_3e-4_0"), True, "its learning rate, lin_3e-4_0, depends on how many it was asked for, 30"),
         (long(), False, "what it trains depends on how many it was asked for, 30"),
     ],
@@ -660,10 +678,25 @@ def test_runs_that_cannot_be_cut_are_named(fake, settings: dict[str, Any], gener
 
 
 def test_a_report_at_equal_steps(fake, tmp_path, capsys) -> None:
-    record = fake(box(9.0), {10: box(3.0), 20: box(5.0), 30: box(9.0)}, settings=long())
-    main(["report", str(record.path), "--steps", "2e1", "--output", str(tmp_path / "cut")])
-    (row,) = [line.split("|")[1:6] for line in capsys.readouterr().out.splitlines() if line.startswith("| a ")]
-    assert [cell.strip() for cell in row] == ["a", "1/1", "20", "210", "5"]
+    """It says which runs were longer, and whether they failed after that."""
+    curve = {10: box(3.0), 20: box(5.0), 30: box(9.0)}
+    records = [fake(box(9.0), curve, settings=long()), fake(None, curve, BAD, settings=long(), seed=1)]
+    main(["report", *(str(record.path) for record in records), "--steps", "2e1", "--output", str(tmp_path / "cut")])
+    lines = capsys.readouterr().out.splitlines()
+    (row,) = [line.split("|")[1:6] for line in lines if line.startswith("| a ")]
+    assert [cell.strip() for cell in row] == ["a", "2/2", "20", "210", "5"]
+    assert "- Runs of 30 steps, as they stood at 20: 2" in lines
+    assert "- Did not finish after that: 1" in lines
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"), [("0", "--steps 0: give at least one"), ("abc", "abc is no whole number"), ("1.5", "1.5 is no whole")]
+)
+def test_bad_steps_are_named(fake, tmp_path, capsys, steps: str, message: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["report", str(fake(FRONT).path), "--steps", steps, "--output", str(tmp_path / "cut")])
+    assert message in f"{stop.value.code} {capsys.readouterr().err}"
+    assert not (tmp_path / "cut").exists()
 
 
 def test_a_curve_that_stops_short_of_a_common_step_ends_there(fake) -> None:
@@ -773,7 +806,7 @@ def test_a_report_of_two_objectives(fake, tmp_path) -> None:
     assert rows_of(text, "a")[0][1:3] == ["1/3", "20"]
     cells = rows_of(text, "a")[0][4:]
     scores = [1 / 3, (1 + 0.5 + 0.5) / 3, 0, (STILL_DISTANCE + 2 * RANDOM_DISTANCE) / 3]
-    curve_means = [(1 + 0.5 + 0) / 3, (1 + (1 + 0.5) / 2 + 0) / 3]
+    curve_means = [(1 + 0.5 + 0) / 3] * 2
     assert [float(cell.split()[0]) for cell in cells] == pytest.approx([*scores, *curve_means], rel=1e-3)
     assert ["[" in cell for cell in cells] == [True, True, False, True, True, True]  # The regret is of one run.
     assert rows_of(text, r"(standing still)")[0][4:] == ["1", "1", "", f"{STILL_DISTANCE:.4g}", "", ""]
@@ -1107,7 +1140,7 @@ def test_what_the_grid_says_wins_over_options(tmp_path) -> None:
         assert (settings.label, settings.steps) == ("momba", 30_000)
 
 
-@pytest.mark.parametrize("options", [["--seed", "7"], ["--seed=7"], ["--output", "/elsewhere"]])
+@pytest.mark.parametrize("options", [["--seed", "7"], ["--seed=7"], ["--output", "/elsewhere"], ["--resume", "RUN"]])
 def test_options_that_each_cell_has_of_its_own_are_refused(options: list[str]) -> None:
     with pytest.raises(ValueError, match=rf"{options[0].split('=')[0]} is the grid's own"):
         make_cells(["momba"], [ENV], 2, options)
@@ -1538,6 +1571,14 @@ def test_speed_counts_products_and_parameters():
     assert 0 < seconds < 5
 
 
-def test_a_mistyped_part_of_speed_is_named():
-    with pytest.raises(SystemExit, match="'update' is no part of the measurement"):
-        main(["speed", "update"])
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("update", "'update' is no part of the measurement"),
+        ("updates --threads 0", "--threads 0: give at least one"),
+        ("updates --picture speed.png", "--picture speed.png is of the scaling"),
+    ],
+)
+def test_what_speed_cannot_do_is_named(line: str, message: str) -> None:
+    with pytest.raises(SystemExit, match=message):
+        main(["speed", *line.split()])

@@ -194,9 +194,11 @@ def make_cells(
     :param fixed_preferences: by number of objectives how many preferences, each with a run of its own
     :raises ValueError: for a configuration that does not exist, or two of one name
     """
-    for option in ("--seed", "--output"):
+    for option in ("--seed", "--output", "--resume"):
         if any(given.split("=")[0] == option for given in options):
-            raise ValueError(f"{option} is the grid's own for each run: give --seeds and the grid's --output.")
+            raise ValueError(
+                f"{option} is the grid's own for each run: give --seeds and the grid's --output; what was cut off goes on."
+            )
     if seeds < 1:
         raise ValueError(f"seeds={seeds}: at least one is needed.")
     cells: list[Cell] = []

@@ -25,7 +25,7 @@ Metric = Literal["hypervolume", "expected_utility"]
 # The label of runs that were trained and evaluated for one preference alone: points of a front that they form together (4.2.4).
 FIXED_PREFERENCE = "fixed_preference"
 # Settings in which runs of one method may differ.
-NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference_point", "device", "subprocesses")
+NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference_point", "device", "subprocesses", "eval_freq")
 
 
 @dataclass(frozen=True)
@@ -137,26 +137,25 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
 def cut_at(record: Record, steps: int) -> Record:
     """A run as it stood at `steps`, which is as if it had been asked for no more: its evaluation there is the final one.
 
-    A run that was asked for no more is as it is.
+    A run that was asked for no more is as it is. Its extra steps may include those of the episodes that it had begun there.
 
     :raises ValueError: for a longer one that was not evaluated there, or that would have gone otherwise with fewer steps
     """
-    planned = record.config.get("steps", record.evaluations[-1].steps if record.evaluations else 0)
-    if planned <= steps:
+    if record.planned_steps <= steps:
         return record
-    cannot = f"{record.path} cannot be cut at {steps:,} steps"
-    rate = record.config.get("hyperparameters", {}).get("learning_rate", 0.0)
-    if not record.general_policy or not isinstance(rate, int | float):
+    cannot = f"{record.path} cannot be cut at {steps:,} steps, leave it out"
+    rate = flat(record.config).get("hyperparameters.learning_rate", 0.0)
+    if not record.general_policy or not isinstance(rate, float):
         what = "what it trains" if not record.general_policy else f"its learning rate, {rate},"
-        raise ValueError(f"{cannot}: {what} depends on how many it was asked for, {planned:,.0f}.")
+        raise ValueError(f"{cannot}: {what} depends on how many it was asked for, {record.planned_steps:,}.")
     before = [evaluation for evaluation in record.evaluations if evaluation.steps <= steps]
-    cut = replace(record, config={**record.config, "steps": steps}, evaluations=before)
+    cut = replace(record, config={**record.config, "steps": steps}, evaluations=before, whole=record)
     if before and before[-1].steps == steps:
         last = before[-1]
         return replace(cut, final_values=last.values, extra_steps=last.extra_steps, error=None, traceback="")
     if record.error is not None and before == record.evaluations:
         return cut  # It did not get so far.
-    raise ValueError(f"{cannot}: it was evaluated at {', '.join(f'{one.steps:,}' for one in record.evaluations)}.")
+    raise ValueError(f"{cannot}: it was evaluated at {', '.join(f'{one.steps:,}' for one in record.evaluations) or 'none'}.")
 
 
 def is_fixed_preference(record: Record) -> bool:
@@ -246,17 +245,25 @@ def method_settings(record: Record) -> dict[str, Any]:
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"a": {"b": 1}} -> {"a.b": 1.0}: 1 and 1.0 are the same setting."""
+    """{"a": {"b": 1}} -> {"a.b": 1.0}: 1 and 1.0 are the same setting, in lists too."""
     found: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, dict):
             found.update(flat(value, f"{prefix}{name}."))
         else:
-            found[f"{prefix}{name}"] = float(value) if type(value) is int else value
+            found[f"{prefix}{name}"] = _with_floats(value)
     return found
 
 
+def _with_floats(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_with_floats(one) for one in value]
+    return float(value) if type(value) is int else value
+
+
 def setting_text(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(setting_text, value))}]"
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
@@ -267,9 +274,9 @@ def curve_on(runs: Sequence[Run], metric: Metric = "hypervolume") -> tuple[Array
     to have.
     """
     steps = max((run.steps for run in runs), key=lambda s: (s[-1] if len(s) else 0, len(s)))
-    planned = max((float(run.record.config.get("steps", 0)) for run in runs if not run.is_finished), default=0.0)
+    planned = max((run.record.planned_steps for run in runs if not run.is_finished), default=0)
     if len(steps) and planned > steps[-1]:
-        steps = np.append(steps, planned)
+        steps = np.append(steps, np.unique([steps[-1] + 1, planned]))
     curves = []
     for run in runs:
         curve = run.curve if metric == "hypervolume" else run.utility_curve
@@ -316,10 +323,10 @@ def areas_over_time(runs: Sequence[Run], seconds: float, start: float) -> list[f
         return [np.nan] * len(runs)
     areas = []
     for run in runs:
-        times = np.concatenate([[0.0], run.seconds[run.seconds < seconds], [seconds]])
-        known = np.append(0.0, run.seconds), np.append(start, run.curve)
-        curve = np.interp(times, *known, right=None if run.is_finished else 0.0) if len(run.seconds) else 0 * times
-        areas.append(float(trapezoid(curve, times) / seconds))
+        known, curve = np.append(0.0, run.seconds), np.append(start, run.curve)
+        end = seconds if run.is_finished else min(seconds, known[-1])
+        times = np.append(known[known < end], end)
+        areas.append(float(trapezoid(np.interp(times, known, curve), times) / seconds))
     return areas
 
 

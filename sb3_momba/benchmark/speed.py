@@ -262,6 +262,10 @@ def main(given: argparse.Namespace) -> None:
     unknown = [part for part in given.parts if part not in PARTS]
     if unknown:
         raise ValueError(f"{unknown[0]!r} is no part of the measurement: choose from {', '.join(PARTS)}.")
+    if given.picture is not None and given.parts and "scaling" not in given.parts:
+        raise ValueError(f"--picture {given.picture} is of the scaling: ask for that part too.")
+    if given.threads is not None and given.threads < 1:
+        raise ValueError(f"--threads {given.threads}: give at least one.")
     if given.threads is not None:
         th.set_num_threads(given.threads)
     for table in tables(given.parts or PARTS, given.picture):

@@ -8,7 +8,7 @@ from sb3_momba.benchmark.chapter4.differences import coverage_table, differences
 from sb3_momba.benchmark.chapter4.scores import Tasks, in_order, tasks_of
 from sb3_momba.benchmark.chapter4.sections import SECTIONS
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
-from sb3_momba.benchmark.report import add_records, failures, provenance, records_of, repeated_seeds
+from sb3_momba.benchmark.report import add_records, failures, folder_of, provenance, records_of, repeated_seeds
 from sb3_momba.files import atomic_write
 from sb3_momba.records import Record
 
@@ -58,12 +58,10 @@ def of_the_records(tasks: Tasks, records: Sequence[Record]) -> list[str]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_records(parser)
-    parser.add_argument("--output", type=Path, help="folder of chapter4.md and its pictures; by default the first of RECORDS")
 
 
 def main(given: argparse.Namespace) -> None:
     records = records_of(given)
-    first = given.records[0]
-    folder = given.output or (first if first.is_dir() else first.parent)
+    folder = folder_of(given)
     write_chapter(records, folder)
     print(f"Written to {folder / 'chapter4.md'}.")

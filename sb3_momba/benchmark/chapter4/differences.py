@@ -69,7 +69,7 @@ def missing_note(tasks: Tasks, methods: Methods) -> str:
 
 def steps_note(tasks: Tasks, methods: Methods) -> str:
     """Says of methods that stand side by side that they did not have the same steps; empty where they had."""
-    steps = {title: sorted({steps_of(run) for run in all_runs(tasks, labels)}) for title, labels in methods.items()}
+    steps = {title: sorted({run.record.planned_steps for run in all_runs(tasks, labels)}) for title, labels in methods.items()}
     steps = {title: some for title, some in steps.items() if some}
     if len({step for some in steps.values() for step in some}) < 2:
         return ""
@@ -78,12 +78,6 @@ def steps_note(tasks: Tasks, methods: Methods) -> str:
 
 def all_runs(tasks: Tasks, labels: Labels) -> list[Run]:
     return [run for task in tasks.values() for run in runs_of(task, labels)]
-
-
-def steps_of(run: Run) -> int:
-    """That a run was meant to have or, where it does not say, had."""
-    planned = run.record.config.get("steps")
-    return int(planned if planned is not None else run.steps[-1] if len(run.steps) else 0)
 
 
 def listed(numbers: Iterable[float]) -> str:
@@ -98,7 +92,7 @@ def differences(tasks: Tasks) -> list[str]:
     """
     by_label: dict[str, list[Record]] = defaultdict(list)
     for task in tasks.values():
-        for record in records_of(task):
+        for record in recorded_on(task):
             by_label[record.label].append(record)
     alike: dict[str, list[str]] = defaultdict(list)
     for label in sorted(by_label):
@@ -112,7 +106,7 @@ def differences(tasks: Tasks) -> list[str]:
     return [f"- {', '.join(labels)}: {said}." for said, labels in alike.items()]
 
 
-def records_of(task: Task) -> list[Record]:
+def recorded_on(task: Task) -> list[Record]:
     return [run.record for runs in task.methods.values() for run in runs] + task.fixed_preference
 
 

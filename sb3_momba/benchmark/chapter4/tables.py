@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sb3_momba.benchmark.chapter4.differences import MISSING, all_runs, names, range_text, steps_of
+from sb3_momba.benchmark.chapter4.differences import MISSING, all_runs, names, range_text
 from sb3_momba.benchmark.chapter4.layout import CONDITIONING, IMPROVEMENTS, MAIN, Labels, Methods
 from sb3_momba.benchmark.chapter4.scores import (
     Aggregate,
@@ -45,7 +45,7 @@ def summary(tasks: Tasks, labels: Labels) -> list[str]:
     sizes = [parameters_of(runs_of(task, labels)) for task in tasks.values()]
     parameters = [sum(one.values()) for one in sizes if one]
     policies = [n for n in map(n_policies, runs) if n is not None]
-    steps = [steps_of(run) for run in runs]
+    steps = [run.record.planned_steps for run in runs]
     extra = [run.record.extra_steps for run in runs]
     of_training = range_text((min(steps), max(steps)))
     return [
