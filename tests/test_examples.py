@@ -71,7 +71,7 @@ def test_relabelling_and_alignment(tmp_path):
 
 
 def test_two_methods_and_their_report(tmp_path):
-    said = run("capql_vs_momba.py", "40", "grid", cwd=tmp_path)
+    said = run("capql_vs_momba.py", "40", "grid", "MO-Hopper-v4", cwd=tmp_path)
     assert said.count("2/2") == 2
     assert "## Aggregate" in said
 
