@@ -13,14 +13,20 @@ RESULTS = ROOT / "docs" / "results"
 COMMANDS = {"report.md": "report", "chapter4.md": "chapter4"}
 REPORTS = sorted(path for name in COMMANDS for path in RESULTS.rglob(name))
 # What a report takes before the records beside it.
-BEFORE = {"comparison": ["evidence"], "beyond": ["evidence"]}
+ON_CHEETAH = ("baselines/capql", "momba/momba", "momba/her_par")
+BEFORE = {
+    "comparison": ["evidence"],
+    "beyond": ["evidence"],
+    "reduced": [f"evidence/{method}/MO-HalfCheetah-v4" for method in ON_CHEETAH],
+}
+OPTIONS = {"reduced": ["--steps", "3e4"]}
 PINNED = re.search(r"^matplotlib==([\d.]+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("report", REPORTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_reports_are_made_of_the_committed_records(tmp_path, report: Path) -> None:
     folders = [*(RESULTS / name for name in BEFORE.get(report.parent.name, [])), report.parent]
-    main([COMMANDS[report.name], *map(str, folders), "--output", str(tmp_path)])
+    main([COMMANDS[report.name], *map(str, folders), *OPTIONS.get(report.parent.name, []), "--output", str(tmp_path)])
     assert PINNED is not None
     for made in sorted(tmp_path.iterdir()):
         if made.suffix == ".png" and matplotlib.__version__ != PINNED.group(1):
