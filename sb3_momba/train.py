@@ -157,7 +157,7 @@ def whole_number(text: str) -> int:
     except ValueError:
         number = float("nan")
     if not number.is_integer():
-        raise argparse.ArgumentTypeError(f"{text} is no whole number")
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number")
     return int(number)
 
 

@@ -690,7 +690,8 @@ def test_a_report_at_equal_steps(fake, tmp_path, capsys) -> None:
 
 
 @pytest.mark.parametrize(
-    ("steps", "message"), [("0", "--steps 0: give at least one"), ("abc", "abc is no whole number"), ("1.5", "1.5 is no whole")]
+    ("steps", "message"),
+    [("0", "--steps 0: give at least one"), ("abc", "'abc' is no whole number"), ("1.5", "'1.5' is no whole")],
 )
 def test_bad_steps_are_named(fake, tmp_path, capsys, steps: str, message: str) -> None:
     with pytest.raises(SystemExit) as stop:
