@@ -36,10 +36,10 @@ from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
 from sb3_momba.recording import RecordWriter, plain
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
-from sb3_momba.runs import NOT_RECORDED, RunSettings, recorded_settings, run
+from sb3_momba.runs import NOT_RECORDED, RunSettings, recorded_settings, resume, run
 from sb3_momba.train import command_of, main, parse
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
-from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
+from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv, tiny_model
 
 ENV = "mo-hopper-2obj-v5"
 TINY = {"learning_starts": 50, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
@@ -235,6 +235,25 @@ def test_defaults_are_arguments_that_the_policy_takes(policy: str) -> None:
     assert given == {"gamma": 0.5, "policy_kwargs": {"n_critics": 3}}
     assert set(changed) == set(complete)
     assert set(changed["policy_kwargs"]) == set(complete["policy_kwargs"])
+
+
+def test_a_run_goes_on_whose_record_has_names_in_place_of_classes(tmp_path) -> None:
+    """Such as MlpPolicy's activation."""
+
+    def cut(steps: int) -> None:
+        if steps == 70:
+            raise KeyboardInterrupt
+
+    hyperparameters = {**TINY, "policy_kwargs": TINY_MLP}
+    settings = settings_of(
+        tmp_path / "run", policy="MlpPolicy", hyperparameters=hyperparameters, n_episodes=1, checkpoint_freq=60
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run(settings, cut)
+    resume(tmp_path / "run", progress_bar=False)
+    record = read_record(tmp_path / "run" / "record.jsonl")
+    assert record.error is None
+    assert [evaluation.steps for evaluation in record.evaluations] == [60, 120]
 
 
 def test_parameters_are_the_trained_ones(tiny_run) -> None:
