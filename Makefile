@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence comparison beyond reduced rounding sweep-throughput speed torture compat docs linkcheck clean
+.PHONY: demo test browser lint known-fronts first-records evidence comparison beyond ideas reduced rounding sweep-throughput speed torture compat docs linkcheck clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -70,6 +70,12 @@ beyond: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run $(BEYOND) --env MO-Hopper-v4 --seeds 3 --steps 8e4 --output runs/beyond/hopper
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run $(BEYOND) --env MO-HalfCheetah-v4 --seeds 2 --steps 5e4 --output runs/beyond/halfcheetah
 	$(BIN)/python -m sb3_momba.benchmark report docs/results/evidence runs/beyond --output runs/beyond
+
+# What each idea gives to it: 40 runs of some ten minutes of one core.
+ideas: $(VENV)/installed
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --grid ideas --env MO-HalfCheetah-v4 --seeds 2 --steps 3e4 \
+		--set precision=auto --set compile=true --output runs/ideas
+	$(BIN)/python -m sb3_momba.benchmark report runs/ideas
 
 # The ablations of chapter 4 in short, on one task, grid after grid, the dearest last: 72 runs, of which 34 cost a core half an hour
 # (AVX-512 with bfloat16), and those of more updates or wider critics a multiple.

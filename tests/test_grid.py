@@ -82,6 +82,25 @@ def test_runs_for_one_preference_each(tmp_path) -> None:
     np.testing.assert_allclose([one.preference for one in settings[4:]], preference_grid(3, 6))
 
 
+def test_variations_are_the_first_variant_with_other_settings(tmp_path) -> None:
+    variations = {"near": {"gamma": 0.9}, "wide": {"policy_kwargs.critic_hidden_dim": 1024, "critic_loss": "mse"}}
+    path = written(tmp_path, tasks=["MO-Hopper-v4"], seeds=1, options={"set": {"gamma": 0.95}}, variations=variations)
+    found = asked_for(grid=[path])
+    assert [cell.name.split("/")[0] for cell in found] == ["momba", "near", "wide", "capql"]
+    momba, near, wide, _ = settings = [train.parse(cell.arguments(tmp_path / cell.name)) for cell in found]
+    assert [one.label for one in settings] == ["momba", "near", "wide", "capql"]
+    assert [one.hyperparameters["gamma"] for one in (momba, near, wide)] == [0.95, 0.9, 0.95]
+    assert wide.hyperparameters["critic_loss"] == "mse"
+    assert wide.hyperparameters["policy_kwargs"]["critic_hidden_dim"] == 1024
+    near.hyperparameters["gamma"] = 0.95
+    assert near.hyperparameters == momba.hyperparameters
+
+
+def test_a_variation_and_a_variant_of_one_name_are_an_error(tmp_path) -> None:
+    with pytest.raises(ValueError, match=r"momba and capql have one name, capql/MO-Hopper-v4/0"):
+        asked_for(grid=[written(tmp_path, variations={"capql": {"gamma": 0.9}})])
+
+
 def test_a_number_of_objectives_without_preferences_is_an_error(tmp_path) -> None:
     path = written(tmp_path, tasks=["MO-Hopper-3obj-v4"], fixed_preferences={2: 20})
     with pytest.raises(ValueError, match=r"fixed_preferences=\{2: 20\}: MO-Hopper-3obj-v4 has 3 objectives"):
@@ -99,6 +118,8 @@ BAD = {
     "an option that is no name": ({"options": {5: 3}}, "it must be a mapping of options with their values"),
     "an environment among the options": ({"options": {"env": "MO-Ant-v4"}}, "none of seed, output, env"),
     "a start of alpha that is no number": ({"auto_ent_coef": "low"}, "auto_ent_coef is 'low'; it must be a number"),
+    "a variation without settings": ({"variations": {"near": {}}}, "variations is {'near': {}}; it must be a mapping of names"),
+    "a variation that is a path": ({"variations": {"../near": {"gamma": 0.9}}}, "none of them a path"),
     "no seeds": ({"seeds": 0}, "seeds=0: at least one"),
     "variants that are no list": ({"variants": "momba"}, "variants is 'momba'; it must be a list of names"),
     "options that are no mapping": ({"options": ["--steps"]}, "options is"),
@@ -190,8 +211,8 @@ def test_shipped_grids_are_of_the_seven_tasks(name: str) -> None:
     grid = read_grid(name)
     assert sorted(grid.tasks) == sorted(TASKS)
     assert len(set(grid.variants)) == len(grid.variants)
-    for cell in make_cells(grid.variants, grid.tasks[:1], 1, as_arguments(grid.options)):
-        assert cell.program.parse(cell.arguments(Path("x"))).label == cell.conf
+    for cell in make_cells(grid.variants, grid.tasks[:1], 1, as_arguments(grid.options), variations=grid.variations):
+        assert cell.program.parse(cell.arguments(Path("x"))).label == (cell.method or cell.conf)
 
 
 def test_no_two_variants_of_the_shipped_grids_are_one_method() -> None:

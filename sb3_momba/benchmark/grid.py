@@ -6,6 +6,7 @@ A grid is a yaml file:
     tasks: [MO-Hopper-v4]            # environment ids
     seeds: 10                        # they are 0 to 9
     options: {eval_freq: 20_000}     # of `python -m sb3_momba.train`; none by default
+    variations: {wide: {policy_kwargs.critic_hidden_dim: 1024}} # by name: the first variant with other settings
     auto_ent_coef: 0.01              # where variants that learn alpha start it; by default their own
     fixed_preferences: {2: 20}       # by number of objectives: one run of a single variant for each of so many (section 4.2.4)
 """
@@ -13,7 +14,7 @@ A grid is a yaml file:
 import argparse
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
@@ -44,6 +45,13 @@ def _are_options(x: Any) -> bool:
     )
 
 
+def _are_variations(x: Any) -> bool:
+    return isinstance(x, dict) and all(
+        isinstance(name, str) and Path(name).name == name and isinstance(settings, dict) and len(settings) > 0
+        for name, settings in x.items()
+    )
+
+
 def _is_number_of(x: Any) -> bool:
     return isinstance(x, int) and not isinstance(x, bool)
 
@@ -56,6 +64,7 @@ ENTRIES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "tasks": (_is_list_of_names, "a list of names"),
     "seeds": (_is_number_of, "a whole number"),
     "options": (_are_options, f"a mapping of options with their values, none of {', '.join(OF_THE_GRID)}"),
+    "variations": (_are_variations, "a mapping of names, none of them a path, to mappings of settings such as {gamma: 0.9}"),
     "auto_ent_coef": (is_number, "a number"),
     "fixed_preferences": (
         lambda x: isinstance(x, dict) and all(map(_is_number_of, [*x, *x.values()])),
@@ -133,6 +142,7 @@ class Grid:
     tasks: list[str]
     seeds: int
     options: dict[str, Any] = field(default_factory=dict)
+    variations: dict[str, dict[str, Any]] = field(default_factory=dict)
     auto_ent_coef: float | None = None
     fixed_preferences: dict[int, int] = field(default_factory=dict)
 
@@ -186,11 +196,13 @@ def make_cells(
     options: Sequence[str] = (),
     auto_ent_coef: float | None = None,
     fixed_preferences: Mapping[int, int] | None = None,
+    variations: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> list[Cell]:
     """Seeds vary slowest, so that whatever is finished compares all methods.
 
     :param seeds: how many
     :param auto_ent_coef: where configurations that learn alpha start it, all alike
+    :param variations: by name: settings in which the first configuration is run besides
     :param fixed_preferences: by number of objectives how many preferences, each with a run of its own
     :raises ValueError: for a configuration that does not exist, or two of one name
     """
@@ -209,7 +221,13 @@ def make_cells(
                 start = ("--ent-coef", f"auto_{auto_ent_coef}") if auto_ent_coef is not None and learned else ()
                 cell = Cell(conf, env, seed, (*start, *options))
                 cells += _with_fixed_preferences(cell, fixed_preferences) if fixed_preferences else [cell]
+                if conf == confs[0]:
+                    cells += [_varied(cell, name, settings) for name, settings in (variations or {}).items()]
     return merged(cells)
+
+
+def _varied(cell: Cell, name: str, settings: Mapping[str, Any]) -> Cell:
+    return replace(cell, options=(*cell.options, *as_arguments({"set": settings}), "--label", name), method=name)
 
 
 def learns_alpha(conf: str, env: str) -> bool:
@@ -225,12 +243,10 @@ def _with_fixed_preferences(cell: Cell, numbers: Mapping[int, int]) -> list[Cell
     if n_objectives not in numbers:
         raise ValueError(f"fixed_preferences={dict(numbers)}: {cell.env} has {n_objectives} objectives; say how many for it.")
     return [
-        Cell(
-            cell.conf,
-            cell.env,
-            cell.seed,
-            (*cell.options, "--label", FIXED_PREFERENCE, "--preference", *map(str, preference)),
-            f"{FIXED_PREFERENCE}-{number:02}",
+        replace(
+            cell,
+            options=(*cell.options, "--label", FIXED_PREFERENCE, "--preference", *map(str, preference)),
+            method=f"{FIXED_PREFERENCE}-{number:02}",
         )
         for number, preference in enumerate(preference_grid(n_objectives, numbers[n_objectives]).tolist())
     ]
@@ -310,5 +326,6 @@ def cells_of(given: argparse.Namespace, options: Sequence[str]) -> list[Cell]:
             [*as_arguments(grid.options), *options],
             grid.auto_ent_coef if given.auto_ent_coef is None else given.auto_ent_coef,
             grid.fixed_preferences,
+            grid.variations,
         )
     return merged(cells)
