@@ -77,7 +77,12 @@ VARIANTS = {
     "held noise, a delayed actor, three environments": {
         **{"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15", "return_scaling": "deviation", "n_envs": 3},
     },
-    "corner weights, two environments": {"her": True, "her_kwargs": {"corner_probability": 0.5}, "n_envs": 2},
+    "corner weights and gains, two environments": {
+        "her": True,
+        "her_kwargs": {"corner_probability": 0.5},
+        "preference_sampler": "gain",
+        "n_envs": 2,
+    },
     "XqcPolicy, vector": {"policy": "XqcPolicy", "vector_values": True},
     "FlashSacPolicy, HER": {"policy": "FlashSacPolicy", "her": True},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},

@@ -13,7 +13,7 @@ from mo_gymnasium.wrappers.wrappers import LinearReward
 
 from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, PreferenceWrapper
 from sb3_momba.envs.pgmorl import TASKS
-from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler, make_sampler
+from sb3_momba.envs.preferences import ConeSampler, FixedSampler, GainSampler, PerStepSampler, UniformSampler, make_sampler
 from sb3_momba.nn.layers import Film, HyperDense
 from sb3_momba.nn.networks import CONDITIONINGS
 from sb3_momba.train import main, parse
@@ -186,10 +186,46 @@ def test_cone_stays_within_its_angle_and_fills_it(n_objectives: int) -> None:
     np.testing.assert_allclose(draws.mean(axis=0), 1 / n_objectives, atol=0.02)
 
 
+def test_gain_is_where_the_latest_answer_is_far_from_the_best() -> None:
+    """The answer to (1, 0) earns 1 of it, the one to (0, 1) 3: around (1, 0) there are 2 to gain. Around (0, 1) nothing."""
+    sampler, rng = GainSampler(2, candidates=100), np.random.default_rng(0)
+    preferences, returns = np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.0], [3.0, 1.0]])
+    draws = np.array([sampler(rng, preferences, returns) for _ in range(20)])
+    assert (draws[:, 0] > 0.9).all()
+    np.testing.assert_allclose(draws.sum(axis=1), 1)
+    nothing = np.zeros((0, 2))
+    assert np.mean([sampler(rng, nothing, nothing)[0] for _ in range(400)]) == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_sampler_with_a_memory_is_told_of_the_latest_episodes() -> None:
+    told: list[tuple[np.ndarray, np.ndarray]] = []
+
+    class Asked:
+        memory = 2
+
+        def __call__(self, rng: np.random.Generator, preferences: np.ndarray, returns: np.ndarray) -> np.ndarray:
+            told.append((preferences, returns))
+            return np.array([len(told), 10 - len(told)]) / 10
+
+    env = PreferenceWrapper(StubEnv(), Asked())
+    earned = []
+    for _ in range(4):
+        env.reset()
+        vector_return, over = np.zeros(2), False
+        while not over:
+            _, _, terminated, truncated, info = env.step(env.action_space.sample())
+            vector_return, over = vector_return + info["vector_reward"], terminated or truncated
+        earned.append(vector_return)
+    assert [len(preferences) for preferences, _ in told] == [0, 1, 2, 2]
+    np.testing.assert_allclose(told[-1][0], [[0.2, 0.8], [0.3, 0.7]], rtol=1e-6)
+    np.testing.assert_allclose(told[-1][1], earned[1:3], rtol=1e-6)
+
+
 def test_samplers_from_literals() -> None:
     assert make_sampler("uniform", 3) == UniformSampler(3)
     assert make_sampler({"name": "cone", "angle": 10.0}, 2) == ConeSampler(2, 10.0)
     assert make_sampler({"name": "fixed", "preference": [0.25, 0.75]}, 2) == FixedSampler((0.25, 0.75))
+    assert make_sampler({"name": "gain", "memory": 9}, 2) == GainSampler(2, memory=9)
     assert make_sampler({"name": "uniform", "per_step": True}, 2) == PerStepSampler(UniformSampler(2))
     own = UniformSampler(2)
     assert make_sampler(own, 2) is own
@@ -198,7 +234,9 @@ def test_samplers_from_literals() -> None:
 @pytest.mark.parametrize(
     ("spec", "match"),
     [
-        ("sphere", "name must be uniform, cone or fixed, not 'sphere'"),
+        ("sphere", "name must be uniform, cone, gain or fixed, not 'sphere'"),
+        ({"name": "gain", "memory": 0}, "memory=0: it must be a whole number of at least 1"),
+        ({"name": "gain", "per_step": True}, "leave per_step out"),
         ({"name": "cone", "radius": 3}, "radius"),
         ({"name": "fixed"}, "preference"),
         ({"name": "fixed", "preference": [0.5, 0.6]}, "sums to 1.1"),

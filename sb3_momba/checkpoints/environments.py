@@ -39,6 +39,8 @@ def check(states: Any, n_objectives: int, action_space: spaces.Space[Any]) -> No
         shapes: dict[str, tuple[int, ...]] = {"preference": (n_objectives,), "vector_return": (n_objectives,)}
         if state["actions"] is not None and len(state["actions"]) > 0:
             shapes["actions"] = (len(state["actions"]), *(action_space.shape or ()))
+        if "played" in state:
+            shapes["played"] = (len(state["played"]), 2, n_objectives)
         for name, shape in shapes.items():
             if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind not in "fiu":
                 raise TypeError(f"an environment's {name} are no numbers of shape {shape}")

@@ -1,7 +1,8 @@
 """Preferences on the probability simplex (Definition 3): checks, samplers and grids.
 
 A sampler is any callable `rng -> (n_objectives,)`, where rng is a `numpy.random.Generator`. One with a true attribute
-`per_step` is asked for a new preference after every step instead of every episode.
+`per_step` is asked for a new preference after every step instead of every episode. One with a number `memory` is called with
+the preferences and the undiscounted returns of so many of the environment's latest episodes too, both (n, n_objectives).
 """
 
 import logging
@@ -104,11 +105,41 @@ class ConeSampler:
         return w / w.sum()
 
 
+@dataclass(frozen=True)
+class GainSampler:
+    """Of some preferences from the uniform distribution, the one at which there is most to gain: where the latest answer to the
+    nearest preference earns least beside the best of all latest answers (as GPI-LS chooses by its critics' values; Alegre et
+    al., 2023). Each choice looks at other candidates, so that every preference's turn comes.
+
+    :param candidates: that one is chosen of
+    :param memory: latest episodes that are looked back on
+    """
+
+    n_objectives: int
+    candidates: int = 8
+    memory: int = 50
+
+    def __post_init__(self) -> None:
+        for name, number in (("candidates", self.candidates), ("memory", self.memory)):
+            if not isinstance(number, int) or number < 1:
+                raise ValueError(f"{name}={number!r}: it must be a whole number of at least 1")
+
+    def __call__(
+        self, rng: np.random.Generator, preferences: np.ndarray | None = None, returns: np.ndarray | None = None
+    ) -> np.ndarray:
+        w = rng.dirichlet(np.ones(self.n_objectives), self.candidates)
+        if preferences is None or returns is None or len(preferences) == 0:
+            return w[0]
+        utilities = w @ returns.T  # (candidates, n)
+        nearest = np.abs(w[:, None] - preferences).sum(axis=-1).argmin(axis=1)
+        return w[(utilities.max(axis=1) - utilities[np.arange(len(w)), nearest]).argmax()]
+
+
 def make_sampler(spec: PreferenceSampler | SamplerSpec, n_objectives: int) -> PreferenceSampler:
     """A sampler from a literal, as configuration files write it; a callable is returned as it is.
 
-    :param spec: "uniform"; "cone"; weights to keep; or a dictionary with `name`, for "cone" the `angle` in degrees, for
-        "fixed" the `preference`, and `per_step` for a new preference after every step
+    :param spec: "uniform"; "cone"; "gain"; weights to keep; or a dictionary with `name`, for "cone" the `angle` in degrees, for
+        "gain" its `candidates` and `memory`, for "fixed" the `preference`, and `per_step` for a new preference after every step
     :raises ValueError: for anything else
     """
     if callable(spec):
@@ -125,11 +156,15 @@ def make_sampler(spec: PreferenceSampler | SamplerSpec, n_objectives: int) -> Pr
             sampler = UniformSampler(n_objectives, **options)
         elif name == "cone":
             sampler = ConeSampler(n_objectives, **options)
+        elif name == "gain" and not per_step:
+            sampler = GainSampler(n_objectives, **options)
+        elif name == "gain":
+            raise ValueError("it compares the returns of episodes: leave per_step out")
         elif name == "fixed":
             w = check_preference(options.pop("preference"), n_objectives)
             sampler = FixedSampler(tuple(w.tolist()), **options)
         else:
-            raise ValueError(f"its name must be uniform, cone or fixed, not {name!r}")
+            raise ValueError(f"its name must be uniform, cone, gain or fixed, not {name!r}")
     except (TypeError, KeyError, ValueError) as error:
         raise ValueError(f"preference_sampler={spec!r} is not understood: {str(error).rstrip('.')}.") from error
     return PerStepSampler(sampler) if per_step else sampler

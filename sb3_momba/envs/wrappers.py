@@ -59,6 +59,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._preference: np.ndarray | None = None
         self._holds_for_episode = False
         self._rng = np.random.default_rng()
+        self._played = np.zeros((0, 2, self.n_objectives))  # preference and return of episodes, for a sampler with a memory
         self._episode_step = 0
         self._episode: dict[str, Any] = {"actions": None, "vector_return": np.zeros(self.n_objectives)}
 
@@ -142,12 +143,19 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         vector_reward = self._check_reward(reward)
         self._episode["vector_return"] += vector_reward
         w = self._preference
+        if terminated or truncated:
+            self._remember(w, self._episode["vector_return"])
         # As long as the environment uses the same dict again, ours must be another one.
         info = {**info, "vector_reward": vector_reward, "preference": w.copy()}
         if self._fixed_preference is not None or getattr(self.preference_sampler, "per_step", False):
             if not self._holds_for_episode:
                 self._preference = self._next_preference()
         return self._observe(observation), float(np.dot(w, vector_reward)), terminated, truncated, info
+
+    def _remember(self, preference: np.ndarray, vector_return: np.ndarray) -> None:
+        memory = getattr(self.preference_sampler, "memory", 0)
+        if memory > 0:
+            self._played = np.concatenate([self._played, [[preference, vector_return]]])[-memory:]
 
     def _note_action(self, action: np.ndarray) -> None:
         """For a checkpoint in mid-episode, up to LONGEST_REPLAY of them."""
@@ -170,6 +178,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             "fixed_preference": self._fixed_preference,
             "holds_for_episode": self._holds_for_episode,
             "rng_now": self._rng.bit_generator.state,
+            "played": self._played,
         }
 
     def begin_replay(self, state: dict[str, Any]) -> dict[str, Any]:
@@ -185,12 +194,14 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._fixed_preference, self._preference = state["fixed_preference"], state["preference"]
         self._holds_for_episode = state["holds_for_episode"]
         self._rng.bit_generator.state = state["rng_now"]
+        self._played = state.get("played", self._played)
         return self._observe(self._observation), self._episode["vector_return"]
 
     def _next_preference(self) -> np.ndarray:
         if self._fixed_preference is not None:
             return self._fixed_preference.copy()
-        drawn = self.preference_sampler(self._rng)
+        has_memory = getattr(self.preference_sampler, "memory", 0) > 0
+        drawn = self.preference_sampler(self._rng, *(self._played.swapaxes(0, 1) if has_memory else ()))
         try:
             return self._one_preference(drawn)
         except ValueError as error:
