@@ -2,10 +2,11 @@
 
 import contextlib
 import json
-import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -13,7 +14,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +23,7 @@ import yaml
 from scipy.spatial import ConvexHull
 
 from sb3_momba import recording, runs, train
-from sb3_momba.benchmark import local, speed
+from sb3_momba.benchmark import execution, local, speed
 from sb3_momba.benchmark.__main__ import main
 from sb3_momba.benchmark.execution import has_to_run
 from sb3_momba.benchmark.grid import Cell, make_cells
@@ -1270,16 +1271,16 @@ def test_a_second_grid_on_the_same_folder_is_refused_while_one_runs(training, tm
     fake_training = training()
     refusals: list[str] = []
 
-    def run_meanwhile(command: list[str], **kwargs: Any) -> SimpleNamespace:
-        monkeypatch.setattr(subprocess, "run", fake_training)
+    def run_meanwhile(command: list[str], log: IO[bytes]) -> int:
+        put_in_place(monkeypatch, fake_training)
         with pytest.raises(ValueError, match="Another process writes into") as error:
             run_grid(second, tmp_path / "grid")
         refusals.append(str(error.value))
         refusals.append(error_of("run", "--conf", "capql", "--env", ENV, "--seeds", "1", "--output", tmp_path / "grid"))
         assert len(run_grid(second, tmp_path / "other")) == 0
-        return fake_training(command, **kwargs)
+        return fake_training(command, log)
 
-    monkeypatch.setattr(subprocess, "run", run_meanwhile)
+    put_in_place(monkeypatch, run_meanwhile)
     assert len(run_grid(first, tmp_path / "grid")) == 0
     assert len(refusals) == 2
     assert all(f"Another process writes into {tmp_path / 'grid'}" in refusal for refusal in refusals)
@@ -1305,44 +1306,41 @@ def test_a_grid_that_was_killed_does_not_bar_the_next_one(training, tmp_path) ->
     assert len(run_grid(cells, tmp_path)) == 0
 
 
-REAL_RUN = subprocess.run
-
-
 class FakeTraining:
-    """In the place of subprocess.run: writes the record that a training would, as `outcome` says for each seed."""
+    """In the place of Trainings.run: writes the record that a training would, as `outcome` says for each seed."""
 
     def __init__(self, outcome: dict[int, str] | None = None):
         self.outcome = outcome or {}
         self.seeds: list[int] = []
-        self.environments: list[dict[str, str]] = []
 
-    def __call__(self, command: list[str], stdout: Any = None, env: Any = None, **kwargs: Any) -> SimpleNamespace:
-        if "sb3_momba.train" not in command:
-            return REAL_RUN(command, stdout=stdout, env=env, **kwargs)
+    def __call__(self, command: list[str], log: IO[bytes]) -> int:
         assert command[:3] == [sys.executable, "-m", "sb3_momba.train"]
         settings = train.parse(command[3:])
         self.seeds.append(settings.seed)
-        self.environments.append(env or dict(os.environ))
         folder = Path(settings.output)
         runs.check_empty(folder)  # A training refuses others.
         outcome = self.outcome.get(settings.seed, "finishes")
-        stdout.write(outcome.encode())
+        log.write(outcome.encode())
         if outcome in ("does not start", "is interrupted"):
-            return SimpleNamespace(returncode=1 if outcome == "does not start" else 130)
+            return 1 if outcome == "does not start" else 130
         error = {"fails": BAD, "is cut off": "cut off"}.get(outcome)
         config = runs.recorded_settings(settings)
         write_record(
             folder / "record.jsonl", FRONT if error is None else None, error=error, seed=settings.seed, settings=config
         )
         (folder / "model.zip").touch()
-        return SimpleNamespace(returncode=int(error is not None))
+        return int(error is not None)
+
+
+def put_in_place(monkeypatch: pytest.MonkeyPatch, training: Callable[[list[str], IO[bytes]], int]) -> None:
+    monkeypatch.setattr(local.Trainings, "run", lambda trainings, command, log: training(command, log))
 
 
 @pytest.fixture
 def training(monkeypatch) -> Callable[..., FakeTraining]:
     def replace(outcome: dict[int, str] | None = None) -> FakeTraining:
         fake_training = FakeTraining(outcome)
-        monkeypatch.setattr(subprocess, "run", fake_training)
+        put_in_place(monkeypatch, fake_training)
         return fake_training
 
     return replace
@@ -1353,7 +1351,6 @@ def test_what_ended_is_not_run_again_and_what_was_cut_off_is(training, tmp_path)
     first = training({1: "fails", 2: "is cut off", 3: "does not start"})
     assert len(run_grid(cells, tmp_path, processes=1)) == 3
     assert sorted(first.seeds) == [0, 1, 2, 3]
-    assert {environment["OMP_NUM_THREADS"] for environment in first.environments} == {"1"}
     failed = (tmp_path / cells[1].name / "record.jsonl").read_bytes()
 
     second = training()
@@ -1483,16 +1480,14 @@ def test_a_grid_with_failures_ends_with_their_number(training, tmp_path) -> None
     for _ in range(2):
         training({0: "fails", 2: "fails"})
         message = error_of("run", *arguments)
-        assert "2 runs failed" in message
+        assert "2 runs did not finish" in message
         assert str(tmp_path) in message
 
 
 def test_options_are_handed_on(training, tmp_path, monkeypatch) -> None:
     seen: list[list[str]] = []
     fake_training = training()
-    monkeypatch.setattr(
-        subprocess, "run", lambda command, **kwargs: (seen.append(command), fake_training(command, **kwargs))[1]
-    )
+    put_in_place(monkeypatch, lambda command, log: (seen.append(command), fake_training(command, log))[1])
     line = f"run --conf momba --env {ENV} --seeds 1 --output {tmp_path} --auto-ent-coef 0.01 --steps 3e4 --set gamma=0.9"
     main(line.split())
     settings = train.parse(seen[0][3:])
@@ -1514,19 +1509,47 @@ def test_a_run_that_is_interrupted_while_it_starts_has_not_failed(training, tmp_
 def test_an_interrupted_grid_begins_nothing_more(tmp_path, monkeypatch, capsys) -> None:
     begun: list[Any] = []
 
-    def interrupted(command: Any, **kwargs: Any) -> None:
+    def interrupted(command: list[str], log: IO[bytes]) -> int:
         begun.append(command)
         if len(begun) > 1:
             time.sleep(1)  # A run takes its time: by then the grid has heard of the first one.
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(subprocess, "run", interrupted)
+    put_in_place(monkeypatch, interrupted)
     line = f"run --conf momba --env {ENV} --seeds 5 --processes 1 --output {tmp_path}"
     with pytest.raises(SystemExit) as stop:
         main(line.split())
     assert stop.value.code == 130
     assert "Interrupted" in capsys.readouterr().err
     assert len(begun) <= 2
+
+
+def test_sigterm_ends_the_trainings_with_their_grid(tmp_path) -> None:
+    trainings, ended = local.Trainings(), []
+    command = [sys.executable, "-c", "import time; print('trains', flush=True); time.sleep(600)"]
+    with open(tmp_path / "log", "w+b") as log:
+        thread = threading.Thread(target=lambda: ended.append(trainings.run(command, log)))
+        thread.start()
+        while not (tmp_path / "log").read_bytes():
+            time.sleep(0.05)
+        with pytest.raises(KeyboardInterrupt), local.ended_by_sigterm(trainings):
+            signal.raise_signal(signal.SIGTERM)
+        thread.join(10)
+        assert ended == [-signal.SIGTERM]
+        assert trainings.run(command, log) == -signal.SIGTERM  # It does not begin.
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_nothing_begins_on_a_full_disk(training, tmp_path, monkeypatch) -> None:
+    fake_training = training()
+    cells = make_cells(["momba"], [ENV], 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(execution.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1_000))
+        message = error_of("run", "--conf", "momba", "--env", ENV, "--seeds", "2", "--output", tmp_path)
+    assert "2 runs did not finish" in message
+    assert fake_training.seeds == []
+    assert execution.failed(cells, tmp_path) == {cell.name: "no record: it never began" for cell in cells}
+    assert run_grid(cells, tmp_path) == {}
 
 
 def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
@@ -1543,7 +1566,7 @@ def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
     assert record.start["machine"]["torch_threads"] == 1
     assert (folder / "model.zip").exists()
 
-    monkeypatch.setattr(local.subprocess, "run", lambda *args, **kwargs: pytest.fail("it is run again"))
+    put_in_place(monkeypatch, lambda command, log: pytest.fail("it is run again"))
     main([*line.split(), *options.split()])
     main(["report", str(tmp_path / "grid")])
     text = (tmp_path / "grid" / "report.md").read_text()

@@ -531,7 +531,10 @@ def test_every_table_and_figure_of_a_full_set_of_records(everything, tmp_path) -
 
 
 def test_one_run_leaves_the_rest_missing(fake, tmp_path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "figure-4.9.png").write_bytes(b"of other records")
     text = write_chapter([fake("capql", FRONT)], tmp_path / "out")
+    assert not (tmp_path / "out" / "figure-4.9.png").exists()
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"chapter4.md", "figure-4.1.png", "figure-4.2.png"}
     assert text.count("Not drawn: there are no runs for it.") == 8
     assert "Missing: Momba, PGMORL, GPI-LS, DPMORL (all tasks)." in text

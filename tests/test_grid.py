@@ -107,6 +107,18 @@ def test_a_number_of_objectives_without_preferences_is_an_error(tmp_path) -> Non
         asked_for(grid=[path])
 
 
+def test_settings_that_cannot_be_are_named_with_their_run(tmp_path) -> None:
+    (bad,) = make_cells(["value_mlp_ce_vector"], ["MO-Hopper-v4"], 1, ["--set", "policy_kwargs.critic_hidden_dim=16"])
+    with pytest.raises(ValueError, match=r"^value_mlp_ce_vector/MO-Hopper-v4/0: policy_kwargs: MlpPolicy has no argument"):
+        grid.checked([bad], tmp_path)
+    (bad,) = make_cells(["gpi_ls"], ["MO-Hopper-v4"], 1, ["--steps", "130"])
+    with pytest.raises(ValueError, match=r"^gpi_ls/MO-Hopper-v4/0: steps=130 is no whole number"):
+        grid.checked([bad], tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="file is a file: give a folder"):
+        grid.checked(make_cells(["momba"], ["MO-Hopper-v4"], 1), tmp_path / "file")
+
+
 BAD = {
     "an entry that there is not": ({"task": []}, "A grid has no entry 'task': did you mean 'tasks'"),
     "seeds that are no number": ({"seeds": "ten"}, "seeds is 'ten'; it must be a whole number"),

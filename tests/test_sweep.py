@@ -155,7 +155,7 @@ def test_what_a_training_raises_ends_it_and_the_others_go_on(tmp_path, capsys) -
     output = tmp_path / "sweep"
     arguments = ["sweep", "--conf", "momba", "--env", ENV, "tests.stubs:diverging-v0", "--seeds", "1", "--output", str(output)]
     arguments += [*TINY.format(steps=400).split(), "--workers", "2"]
-    with pytest.raises(SystemExit, match="error: 1 runs failed"):
+    with pytest.raises(SystemExit, match="error: 1 runs did not finish"):
         main(arguments)
     failed = "momba/tests.stubs:diverging-v0/0"
     said = capsys.readouterr().err
@@ -166,7 +166,7 @@ def test_what_a_training_raises_ends_it_and_the_others_go_on(tmp_path, capsys) -
     assert record.traceback.startswith("Traceback (most recent call last):")
     assert ended(output / f"momba/{ENV}/0")
     # Once more: nothing runs, so that nothing needs Ray.
-    with pytest.raises(SystemExit, match="error: 1 runs failed"):
+    with pytest.raises(SystemExit, match="error: 1 runs did not finish"):
         main([*arguments, "--address", "127.0.0.1:9"])
 
 
@@ -297,6 +297,15 @@ def test_no_cluster_on_this_machine_is_one_line_of_error(tmp_path, monkeypatch) 
     monkeypatch.setattr(trials.ray, "init", finds_none)
     with pytest.raises(SystemExit, match="error: Ray at 'auto' cannot be reached: Could not find any running"):
         main([*sweep_arguments(tmp_path), "--address", "auto"])
+
+
+def test_a_ray_that_does_not_start_is_one_line_of_error(tmp_path, monkeypatch) -> None:
+    def is_too_slow(**kwargs: Any) -> None:
+        raise Exception("The current node timed out during startup.")
+
+    monkeypatch.setattr(trials.ray, "init", is_too_slow)
+    with pytest.raises(SystemExit, match=r"error: Ray did not start on this machine.* timed out during startup"):
+        main(sweep_arguments(tmp_path))
 
 
 def test_what_no_node_can_run_is_refused(tmp_path, monkeypatch) -> None:

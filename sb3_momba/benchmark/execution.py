@@ -1,6 +1,7 @@
 """The runs of a grid, whatever runs them: which of them still have to, from where, and which have failed."""
 
 import contextlib
+import errno
 import shutil
 import sys
 import time
@@ -17,6 +18,7 @@ from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_
 from sb3_momba.runs import CHECKPOINTS
 from sb3_momba.zoo.configuration import with_later_settings
 
+LEAST_BYTES_FREE = 10_000_000  # of a disk, for a run to begin or go on
 SECONDS_FOR_A_LOCK = 120.0  # in which the process that has lost a cell notices it and ends
 
 State = Literal["not begun", "cut off", "failed", "finished"]
@@ -57,8 +59,12 @@ def way_to_run(folder: Path, retry_failed: bool = False) -> Literal["begin", "go
 
     :raises FolderInUseError: if a process that had lost the cell still writes into the folder after two minutes
     :raises FileFormatError: if there are checkpoints, and none can be read
+    :raises OSError: if the disk is full, before the run fails on it
     """
     with alone_soon_in(folder):
+        free = shutil.disk_usage(folder).free
+        if free < LEAST_BYTES_FREE:
+            raise OSError(errno.ENOSPC, f"The disk is full, {free:,} bytes are left", str(folder))
         state = state_of(folder)
         if state == "finished" or (state == "failed" and not retry_failed):
             return None
@@ -125,9 +131,12 @@ def failed(cells: Sequence[Cell], output: Path) -> dict[str, str]:
 
 
 def end_with_failures(failures: Mapping[str, str], output: Path) -> None:
-    """Print what failed, by name, and leave with an error if anything did."""
+    """Print what did not finish, by name, and leave with an error if anything did not."""
     for name, text in failures.items():
         print(f"\n{name}\n{indent(text, '    ')}", file=sys.stderr)
     if failures:
         names = ", ".join(failures)
-        sys.exit(f"error: {len(failures)} runs failed ({names}); their logs lie beside their folders in {output}.")
+        sys.exit(
+            f"error: {len(failures)} runs did not finish ({names}); their logs lie beside their folders in {output}. The same "
+            "command goes on with what was cut off or never began, and with --retry-failed with what failed."
+        )

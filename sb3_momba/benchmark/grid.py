@@ -12,8 +12,9 @@ A grid is a yaml file:
 """
 
 import argparse
+import contextlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
@@ -270,16 +271,31 @@ def merged(cells: Iterable[Cell]) -> list[Cell]:
     return list(by_name.values())
 
 
+@contextlib.contextmanager
+def _named(cell: Cell) -> Iterator[None]:
+    """An error inside says which cell it is of."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{cell.name}: {error}") from error
+
+
 def checked(cells: Sequence[Cell], output: Path) -> dict[str, Any]:
     """What the program of each cell reads from its arguments, by the cell's name.
 
     :raises ValueError: for settings that cannot be
     :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
     """
-    settings = {cell.name: cell.program.parse(cell.arguments(output / cell.name)) for cell in cells}
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"--output {output} is a file: give a folder.")
+    settings: dict[str, Any] = {}
+    for cell in cells:
+        with _named(cell):
+            settings[cell.name] = cell.program.parse(cell.arguments(output / cell.name))
     one_of_each = {(cell.conf, cell.env, cell.method): cell for cell in cells}.values()
     for cell in one_of_each:
-        cell.program.runs.check(settings[cell.name])
+        with _named(cell):
+            cell.program.runs.check(settings[cell.name])
     by_settings: dict[str, Cell] = {}
     for cell in one_of_each:
         if cell.program is MOMBA:

@@ -4,15 +4,17 @@ A cell whose run ended, well or badly, is not run again; one that was cut off is
 """
 
 import argparse
+import contextlib
 import logging
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from sb3_momba.benchmark import execution, grid
 from sb3_momba.benchmark.grid import Cell
@@ -21,6 +23,50 @@ from sb3_momba.files import FileFormatError, FolderInUseError
 INTERRUPTED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 
 logger = logging.getLogger(__name__)
+
+
+class Trainings:
+    """The processes that train, which end with their grid."""
+
+    def __init__(self) -> None:
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = threading.Lock()
+        self._are_over = False
+
+    def run(self, command: Sequence[str], log: IO[bytes]) -> int:
+        """Until it ends; its return code, negative for a signal."""
+        with self._lock:
+            if self._are_over:
+                return -signal.SIGTERM
+            # Runs side by side share the cores: one thread each.
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+            self._running.add(process)
+        ended = process.wait()
+        with self._lock:
+            self._running.remove(process)
+        return ended
+
+    def end(self, *of_the_signal: Any) -> None:
+        """What SIGTERM does to the grid; Ctrl-C reaches all of its processes by itself."""
+        with self._lock:
+            self._are_over = True
+            for process in self._running:
+                process.terminate()
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def ended_by_sigterm(trainings: Trainings) -> Iterator[None]:
+    """Only the main thread can hear signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, trainings.end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_failed: bool = False) -> dict[str, str]:
@@ -32,9 +78,10 @@ def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_fail
         raise ValueError(f"processes={processes}: at least one is needed.")
 
     def side_by_side(waiting: Sequence[Cell], settings: Mapping[str, Any]) -> dict[str, str]:
-        with ThreadPoolExecutor(processes) as pool:
+        trainings = Trainings()
+        with ended_by_sigterm(trainings), ThreadPoolExecutor(processes) as pool:
             try:
-                said = list(pool.map(lambda cell: _run_cell(cell, settings[cell.name], retry_failed), waiting))
+                said = list(pool.map(lambda cell: _run_cell(cell, settings[cell.name], retry_failed, trainings), waiting))
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
@@ -43,7 +90,7 @@ def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_fail
     return execution.run_cells(cells, output, side_by_side, retry_failed)
 
 
-def _run_cell(cell: Cell, settings: Any, retry_failed: bool) -> str | None:
+def _run_cell(cell: Cell, settings: Any, retry_failed: bool, trainings: Trainings) -> str | None:
     """What kept it from running, if anything did."""
     logger.info("%s starts", cell.name)
     folder = Path(settings.output)
@@ -56,10 +103,8 @@ def _run_cell(cell: Cell, settings: Any, retry_failed: bool) -> str | None:
         arguments = ["--resume", str(folder), "--no-progress-bar"] if way == "go on" else cell.arguments(folder)
         command = [sys.executable, "-m", cell.program.module, *arguments]
         with open(execution.log_of(folder), "ab" if way == "go on" else "wb") as log:
-            # Runs side by side share the cores: one thread each.
-            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            ended = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment, check=False)
-        if execution.state_of(folder) == "not begun" and ended.returncode > 0 and ended.returncode not in INTERRUPTED:
+            ended = trainings.run(command, log)
+        if execution.state_of(folder) == "not begun" and ended > 0 and ended not in INTERRUPTED:
             said = execution.log_of(folder).read_text(errors="replace").rstrip()
             last = said.splitlines()[-1] if said else "no output"
             cell.program.runs.record_failure(settings, f"it did not start: {last}", said)

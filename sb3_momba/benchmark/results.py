@@ -165,7 +165,10 @@ def is_fixed_preference(record: Record) -> bool:
 def _reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
     points = sorted({tuple(record.reference_point.tolist()) for record in records})
     if given is None and len(points) > 1:
-        raise ValueError(f"The records of {name} have the reference points {points}: choose one, --reference-point.")
+        raise ValueError(
+            f"The records of {name} have the reference points {points}: choose one, `benchmark report --reference-point`, or "
+            "leave the others out."
+        )
     reference = records[0].reference_point if given is None else np.asarray(given, dtype=np.float64)
     for record in records:
         if record.preferences.shape[1] != len(reference):

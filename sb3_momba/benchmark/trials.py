@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 def cluster(address: str | None, processors: int, threads: int) -> Iterator[None]:
     """Ray, on this machine alone with so many processors or on a cluster.
 
-    :raises ConnectionError: if no cluster answers
+    :raises ConnectionError: if no cluster answers, or Ray does not start
     """
     arguments: dict[str, Any] = {"address": address}
     if address is None:
@@ -57,7 +57,13 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
             log_to_driver=False,
             logging_level=logging.WARNING,
         )
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # Ray has no class of its own for what goes wrong here.
+        if address is None:
+            raise ConnectionError(
+                "Ray did not start on this machine. It gives itself half a minute, too little where the processors are busy: "
+                "try again later, or use `benchmark run`, which needs no Ray. Its logs lie in /tmp/ray/session_latest/logs. "
+                f"{error}"
+            ) from error
         raise ConnectionError(f"Ray at {address!r} cannot be reached: {error}") from error
     try:
         yield
