@@ -107,7 +107,7 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
     :param resumed: the model of the newest checkpoint instead of a new one
     :raises ValueError: for settings that cannot be
     """
-    if not resumed:  # Those of a record are names where there were classes, and in use no more: the checkpoint has its own.
+    if not resumed:  # A record has names in place of classes; the checkpoint has the hyperparameters themselves.
         check_hyperparameters(settings.policy, settings.hyperparameters)
     for name in ("steps", "checkpoint_freq", "keep_checkpoints"):
         check_whole(name, getattr(settings, name), 1)

@@ -1524,20 +1524,35 @@ def test_an_interrupted_grid_begins_nothing_more(tmp_path, monkeypatch, capsys) 
     assert len(begun) <= 2
 
 
-def test_sigterm_ends_the_trainings_with_their_grid(tmp_path) -> None:
-    trainings, ended = local.Trainings(), []
-    command = [sys.executable, "-c", "import time; print('trains', flush=True); time.sleep(600)"]
-    with open(tmp_path / "log", "w+b") as log:
-        thread = threading.Thread(target=lambda: ended.append(trainings.run(command, log)))
-        thread.start()
-        while not (tmp_path / "log").read_bytes():
-            time.sleep(0.05)
-        with pytest.raises(KeyboardInterrupt), local.ended_by_sigterm(trainings):
-            signal.raise_signal(signal.SIGTERM)
-        thread.join(10)
-        assert ended == [-signal.SIGTERM]
-        assert trainings.run(command, log) == -signal.SIGTERM  # It does not begin.
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+def test_sigterm_ends_the_trainings_with_their_grid(tmp_path, monkeypatch, capsys) -> None:
+    begun: list[subprocess.Popen[bytes]] = []
+
+    class Training(subprocess.Popen[bytes]):
+        """In place of a training: a process that waits, which the grid is told to end as soon as it runs."""
+
+        def __init__(self, command: list[str], **kwargs: Any):
+            if "sb3_momba.train" not in command:
+                super().__init__(command, **kwargs)
+                return
+            super().__init__([sys.executable, "-c", "import time; time.sleep(600)"], **kwargs)
+            begun.append(self)
+            threading.Timer(0.5, signal.pthread_kill, (threading.main_thread().ident, signal.SIGTERM)).start()
+
+        def terminate(self) -> None:
+            if len(signals) == 0:
+                signals.append(signal.SIGTERM)
+                signal.raise_signal(signal.SIGTERM)  # A supervisor signals a process, and its group.
+            super().terminate()
+
+    signals: list[int] = []
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(local.subprocess, "Popen", Training)
+    with pytest.raises(SystemExit) as stop:
+        main(f"run --conf momba --env {ENV} --seeds 5 --processes 1 --output {tmp_path}".split())
+    assert stop.value.code == 130
+    assert "Interrupted" in capsys.readouterr().err
+    assert [process.returncode for process in begun] == [-signal.SIGTERM]
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_nothing_begins_on_a_full_disk(training, tmp_path, monkeypatch) -> None:
@@ -1553,6 +1568,7 @@ def test_nothing_begins_on_a_full_disk(training, tmp_path, monkeypatch) -> None:
 
 
 def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # Runs side by side have one thread each all the same.
     conf = tmp_path / "tiny.yml"
     entry = {"learning_starts": 50, "buffer_size": 200, "batch_size": 8, "policy_kwargs": TINY_SIMBA}
     conf.write_text(yaml.safe_dump({"default": entry}))

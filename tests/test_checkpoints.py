@@ -1,6 +1,7 @@
 """Checkpoints: whole or not there, and a training that goes on from one as if nothing had happened."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -143,7 +144,7 @@ class OwnRandomness(StubEnv):
 
 
 def test_an_environment_that_cannot_be_brought_back_is_named(tmp_path):
-    checkpointed(OwnRandomness(), tmp_path, 65, 100)
+    checkpointed(OwnRandomness(), tmp_path, 65, 100, preference_sampler="gain")
     with pytest.warns(UserWarning, match=r"Environments \[0\] could not be brought back.*as truncated"):
         model = MOMBA.resume(tmp_path, OwnRandomness())
     last = model.replay_buffer.pos - 1
@@ -151,6 +152,7 @@ def test_an_environment_that_cannot_be_brought_back_is_named(tmp_path):
     assert model.replay_buffer.timeouts[last] == 1
     assert (model.policy.return_scale.running_returns == 0).all()
     assert model._last_obs[0, 0] % 1 == 0.5  # a new episode
+    assert len(model.get_env().envs[0].get_wrapper_attr("_played")) == 6  # Those that have ended are remembered.
     model.learn(20, reset_num_timesteps=False)
 
 
@@ -405,7 +407,8 @@ from tests.test_checkpoints import new_model
 class Signal(BaseCallback):
     def _on_step(self):
         if self.num_timesteps == 57:
-            os.kill(os.getpid(), int(sys.argv[2]))
+            for _ in range(2):  # to the process, and to its group
+                os.kill(os.getpid(), int(sys.argv[2]))
         return True
 
 new_model(StubEnv()).learn(100_000, [Signal(), MombaCheckpointCallback(50_000, sys.argv[1])])
@@ -468,6 +471,20 @@ def test_a_signal_at_the_very_end_is_not_lost(tmp_path):
         model.learn(30, [AtTheEnd(), callback])
     assert newest(tmp_path).steps == 30
     assert model.learn(5, callback, reset_num_timesteps=False).num_timesteps == 35
+
+
+def test_a_second_signal_does_not_wait_for_the_checkpoint(tmp_path, monkeypatch):
+    class Impatient(BaseCallback):
+        def _on_step(self):
+            signal.raise_signal(signal.SIGINT)
+            monkeypatch.setattr(callback, "received_at", -math.inf)  # a while ago
+            signal.raise_signal(signal.SIGINT)
+            return True
+
+    callback = MombaCheckpointCallback(100, tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        new_model(StubEnv()).learn(10, [Impatient(), callback])
+    assert checkpoints_in(tmp_path) == []
 
 
 def test_handlers_are_the_users_again_after_an_error(tmp_path):

@@ -16,7 +16,7 @@ from sb3_momba.benchmark.grid import Cell, as_arguments, cells_of, make_cells, m
 from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.files import FileFormatError, FolderInUseError, alone_in
-from sb3_momba.zoo.configuration import read_configuration, with_defaults
+from sb3_momba.zoo.configuration import check_hyperparameters, read_configuration, with_defaults
 from tests.test_benchmark import write_record
 
 MINE = {"variants": ["momba", "capql"], "tasks": ["MO-Hopper-v4", "MO-Ant-v4"], "seeds": 2}
@@ -131,7 +131,15 @@ BAD = {
     "an environment among the options": ({"options": {"env": "MO-Ant-v4"}}, "none of seed, output, env"),
     "a start of alpha that is no number": ({"auto_ent_coef": "low"}, "auto_ent_coef is 'low'; it must be a number"),
     "a variation without settings": ({"variations": {"near": {}}}, "variations is {'near': {}}; it must be a mapping of names"),
-    "a variation that is a path": ({"variations": {"../near": {"gamma": 0.9}}}, "none of them a path"),
+    "a variation that is a path": ({"variations": {"../near": {"gamma": 0.9}}}, "names (letters, digits, _ . -)"),
+    "a variation of the folder above": ({"variations": {"..": {"gamma": 0.9}}}, "names (letters, digits, _ . -)"),
+    "a variation without a name": ({"variations": {"": {"gamma": 0.9}}}, "names (letters, digits, _ . -)"),
+    "a variation like an option": ({"variations": {"--near": {"gamma": 0.9}}}, "names (letters, digits, _ . -)"),
+    "a variation named like its variant": ({"variations": {"momba": {"gamma": 0.9}}}, "is the first variant's own name"),
+    "variations for one preference": (
+        {"variants": ["momba"], "variations": {"near": {"gamma": 0.9}}, "fixed_preferences": {2: 20}},
+        "fixed_preferences and variations: use a grid for each",
+    ),
     "no seeds": ({"seeds": 0}, "seeds=0: at least one"),
     "variants that are no list": ({"variants": "momba"}, "variants is 'momba'; it must be a list of names"),
     "options that are no mapping": ({"options": ["--steps"]}, "options is"),
@@ -225,6 +233,18 @@ def test_shipped_grids_are_of_the_seven_tasks(name: str) -> None:
     assert len(set(grid.variants)) == len(grid.variants)
     for cell in make_cells(grid.variants, grid.tasks[:1], 1, as_arguments(grid.options), variations=grid.variations):
         assert cell.program.parse(cell.arguments(Path("x"))).label == (cell.method or cell.conf)
+
+
+def test_shipped_variations_are_settings_that_there_are_and_no_two_are_alike() -> None:
+    """On any of the tasks: a variant may have settings of its own for some."""
+    grid = read_grid("ideas")
+    for task in grid.tasks:
+        seen: dict[str, str] = {}
+        for cell in make_cells(grid.variants, [task], 1, as_arguments(grid.options), variations=grid.variations):
+            settings = cell.program.parse(cell.arguments(Path("x")))
+            check_hyperparameters(settings.policy, settings.hyperparameters)
+            complete = with_defaults(settings.policy, settings.hyperparameters)
+            assert seen.setdefault(repr(sorted(complete.items(), key=str)), cell.name) == cell.name
 
 
 def test_no_two_variants_of_the_shipped_grids_are_one_method() -> None:

@@ -193,6 +193,9 @@ def test_gain_is_where_the_latest_answer_is_far_from_the_best() -> None:
     draws = np.array([sampler(rng, preferences, returns) for _ in range(20)])
     assert (draws[:, 0] > 0.9).all()
     np.testing.assert_allclose(draws.sum(axis=1), 1)
+    better = np.array([*returns, [4.0, 0.0]])  # the latest answer to (1, 0) counts: nothing to gain there
+    draws = np.array([sampler(rng, np.array([*preferences, [1.0, 0.0]]), better) for _ in range(20)])
+    assert (draws[:, 0] > 0.9).mean() < 0.5
     nothing = np.zeros((0, 2))
     assert np.mean([sampler(rng, nothing, nothing)[0] for _ in range(400)]) == pytest.approx(0.5, abs=0.05)
 
@@ -201,7 +204,7 @@ def test_a_sampler_with_a_memory_is_told_of_the_latest_episodes() -> None:
     told: list[tuple[np.ndarray, np.ndarray]] = []
 
     class Asked:
-        memory = 2
+        remembered_episodes = 2
 
         def __call__(self, rng: np.random.Generator, preferences: np.ndarray, returns: np.ndarray) -> np.ndarray:
             told.append((preferences, returns))
@@ -225,7 +228,7 @@ def test_samplers_from_literals() -> None:
     assert make_sampler("uniform", 3) == UniformSampler(3)
     assert make_sampler({"name": "cone", "angle": 10.0}, 2) == ConeSampler(2, 10.0)
     assert make_sampler({"name": "fixed", "preference": [0.25, 0.75]}, 2) == FixedSampler((0.25, 0.75))
-    assert make_sampler({"name": "gain", "memory": 9}, 2) == GainSampler(2, memory=9)
+    assert make_sampler({"name": "gain", "remembered_episodes": 9}, 2) == GainSampler(2, remembered_episodes=9)
     assert make_sampler({"name": "uniform", "per_step": True}, 2) == PerStepSampler(UniformSampler(2))
     own = UniformSampler(2)
     assert make_sampler(own, 2) is own
@@ -235,7 +238,7 @@ def test_samplers_from_literals() -> None:
     ("spec", "match"),
     [
         ("sphere", "name must be uniform, cone, gain or fixed, not 'sphere'"),
-        ({"name": "gain", "memory": 0}, "memory=0: it must be a whole number of at least 1"),
+        ({"name": "gain", "remembered_episodes": 0}, "remembered_episodes=0: it must be a whole number of at least 1"),
         ({"name": "gain", "per_step": True}, "leave per_step out"),
         ({"name": "cone", "radius": 3}, "radius"),
         ({"name": "fixed"}, "preference"),

@@ -18,7 +18,7 @@ from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_
 from sb3_momba.runs import CHECKPOINTS
 from sb3_momba.zoo.configuration import with_later_settings
 
-LEAST_BYTES_FREE = 10_000_000  # of a disk, for a run to begin or go on
+LEAST_BYTES_FREE = 200_000_000  # of a disk, for a run to begin or go on: two checkpoints and a model of Momba's size
 SECONDS_FOR_A_LOCK = 120.0  # in which the process that has lost a cell notices it and ends
 
 State = Literal["not begun", "cut off", "failed", "finished"]

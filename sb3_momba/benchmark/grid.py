@@ -14,6 +14,7 @@ A grid is a yaml file:
 import argparse
 import contextlib
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import resources
@@ -48,7 +49,7 @@ def _are_options(x: Any) -> bool:
 
 def _are_variations(x: Any) -> bool:
     return isinstance(x, dict) and all(
-        isinstance(name, str) and Path(name).name == name and isinstance(settings, dict) and len(settings) > 0
+        isinstance(name, str) and re.fullmatch(r"\w[\w.-]*", name) and isinstance(settings, dict) and len(settings) > 0
         for name, settings in x.items()
     )
 
@@ -65,7 +66,7 @@ ENTRIES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "tasks": (_is_list_of_names, "a list of names"),
     "seeds": (_is_number_of, "a whole number"),
     "options": (_are_options, f"a mapping of options with their values, none of {', '.join(OF_THE_GRID)}"),
-    "variations": (_are_variations, "a mapping of names, none of them a path, to mappings of settings such as {gamma: 0.9}"),
+    "variations": (_are_variations, "a mapping of names (letters, digits, _ . -) to settings such as {gamma: 0.9}"),
     "auto_ent_coef": (is_number, "a number"),
     "fixed_preferences": (
         lambda x: isinstance(x, dict) and all(map(_is_number_of, [*x, *x.values()])),
@@ -172,6 +173,10 @@ def read_grid(name: str) -> Grid:
     for entry, (fits, description) in ENTRIES.items():
         if entry in entries and not fits(entries[entry]):
             raise ValueError(f"{name}: {entry} is {entries[entry]!r}; it must be {description}.")
+    if "variations" in entries and "fixed_preferences" in entries:
+        raise ValueError(f"{name} has fixed_preferences and variations: use a grid for each.")
+    if (first := Path(entries["variants"][0]).stem) in entries.get("variations", ()):
+        raise ValueError(f"{name}: the variation {first!r} needs another name, this is the first variant's own name.")
     return Grid(**entries)
 
 
@@ -324,7 +329,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def cells_of(given: argparse.Namespace, options: Sequence[str]) -> list[Cell]:
-    """What the command line asks for; its own words win over a grid's.
+    """What the command line asks for; its own words win over a grid's, but not over the settings that make a variation.
 
     :raises ValueError: for neither grids nor configurations, or both
     """

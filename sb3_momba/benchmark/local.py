@@ -30,7 +30,7 @@ class Trainings:
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes]] = set()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # A second signal may come while the first is dealt with.
         self._are_over = False
 
     def run(self, command: Sequence[str], log: IO[bytes]) -> int:
@@ -51,7 +51,7 @@ class Trainings:
         """What SIGTERM does to the grid; Ctrl-C reaches all of its processes by itself."""
         with self._lock:
             self._are_over = True
-            for process in self._running:
+            for process in list(self._running):
                 process.terminate()
         raise KeyboardInterrupt
 

@@ -60,9 +60,8 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
     except Exception as error:  # Ray has no class of its own for what goes wrong here.
         if address is None:
             raise ConnectionError(
-                "Ray did not start on this machine. It gives itself half a minute, too little where the processors are busy: "
-                "try again later, or use `benchmark run`, which needs no Ray. Its logs lie in /tmp/ray/session_latest/logs. "
-                f"{error}"
+                f"Ray did not start on this machine: {error} Its logs lie in /tmp/ray/session_latest/logs. The half minute "
+                "that it has is too little where processors are busy: try later, or use `benchmark run`, which needs no Ray."
             ) from error
         raise ConnectionError(f"Ray at {address!r} cannot be reached: {error}") from error
     try:

@@ -2,9 +2,11 @@
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import threading
+import time
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from sb3_momba.momba import MOMBA
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SECONDS_OF_AN_ECHO = 1.0
 
 logger = logging.getLogger(__name__)
 
@@ -28,8 +31,8 @@ class MombaCheckpointCallback(BaseCallback):
     """Write everything that the training is into `path`, every `save_freq` environment steps and at its end.
 
     `MOMBA.resume(path, env)` goes on from the newest checkpoint that is whole. SIGINT (Ctrl-C) and SIGTERM write one too, and
-    then end the training by KeyboardInterrupt and SystemExit; a second signal does not wait for it. Only one training at a time
-    writes into a folder.
+    then end the training by KeyboardInterrupt and SystemExit; a second signal, a second later or more, does not wait for it.
+    Only one training at a time writes into a folder.
 
     :param save_freq: environment steps, over all training environments
     :param path: folder of the checkpoints
@@ -53,6 +56,7 @@ class MombaCheckpointCallback(BaseCallback):
         self.buffer: PreferenceReplayBuffer | None = None  # whose rows the writer's segments hold
         self.is_between_rollouts = True
         self.received: int | None = None
+        self.received_at = -math.inf
         self.lock = contextlib.ExitStack()
         self.handlers: dict[int, Any] = {}
 
@@ -81,8 +85,14 @@ class MombaCheckpointCallback(BaseCallback):
             self.handlers = {number: signal.signal(number, self._note) for number in SIGNALS}
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self.received = number
-        self._restore_handlers()
+        """End soon; at a second signal at once, unless it is the first one's echo, sent to a process and to its group."""
+        now = time.monotonic()
+        if now < self.received_at + SECONDS_OF_AN_ECHO:
+            return
+        if self.received is not None:
+            self._restore_handlers()
+            signal.raise_signal(number)
+        self.received, self.received_at = number, now
 
     def _restore_handlers(self) -> None:
         while self.handlers:

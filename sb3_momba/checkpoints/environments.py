@@ -96,13 +96,14 @@ def _warn(lost: list[int], why: str) -> None:
 
 def _replay(env: VecEnv, index: int, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
     """[s, w] at the end of the episode so far, and its vector return; None where it ended earlier or was not noted."""
+    (seed_and_options,) = env.env_method("begin_replay", state, indices=[index])
     if state["actions"] is None:
         return None
-    (seed_and_options,) = env.env_method("begin_replay", state, indices=[index])
     env.env_method("reset", **seed_and_options, indices=[index])
     for action in state["actions"]:
         ((_, _, terminated, truncated, _),) = env.env_method("step", action, indices=[index])
         if terminated or truncated:
+            env.env_method("begin_replay", state, indices=[index])  # This episode was not played.
             return None
     (reached,) = env.env_method("end_replay", state, indices=[index])
     return reached[0], reached[1]

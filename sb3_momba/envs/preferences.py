@@ -1,8 +1,9 @@
 """Preferences on the probability simplex (Definition 3): checks, samplers and grids.
 
 A sampler is any callable `rng -> (n_objectives,)`, where rng is a `numpy.random.Generator`. One with a true attribute
-`per_step` is asked for a new preference after every step instead of every episode. One with a number `memory` is called with
-the preferences and the undiscounted returns of so many of the environment's latest episodes too, both (n, n_objectives).
+`per_step` is asked for a new preference after every step instead of every episode. One with a whole number
+`remembered_episodes` is called as `sampler(rng, preferences, returns)`, with those of so many of the environment's latest
+episodes, the newest last: both (n, n_objectives), the returns undiscounted.
 """
 
 import logging
@@ -18,7 +19,7 @@ import numpy as np
 
 from sb3_momba.finite import all_finite
 
-PreferenceSampler = Callable[[np.random.Generator], np.ndarray]
+PreferenceSampler = Callable[..., np.ndarray]
 SamplerSpec = str | dict[str, Any] | Sequence[float]
 
 SIMPLEX_TOLERANCE = 1e-5
@@ -112,16 +113,16 @@ class GainSampler:
     al., 2023). Each choice looks at other candidates, so that every preference's turn comes.
 
     :param candidates: that one is chosen of
-    :param memory: latest episodes that are looked back on
+    :param remembered_episodes: latest ones that are looked back on; of several environments each has its own
     """
 
     n_objectives: int
     candidates: int = 8
-    memory: int = 50
+    remembered_episodes: int = 50
 
     def __post_init__(self) -> None:
-        for name, number in (("candidates", self.candidates), ("memory", self.memory)):
-            if not isinstance(number, int) or number < 1:
+        for name, number in (("candidates", self.candidates), ("remembered_episodes", self.remembered_episodes)):
+            if not isinstance(number, int) or isinstance(number, bool) or number < 1:
                 raise ValueError(f"{name}={number!r}: it must be a whole number of at least 1")
 
     def __call__(
@@ -130,6 +131,7 @@ class GainSampler:
         w = rng.dirichlet(np.ones(self.n_objectives), self.candidates)
         if preferences is None or returns is None or len(preferences) == 0:
             return w[0]
+        preferences, returns = preferences[::-1], returns[::-1]  # Of equally near ones the latest counts.
         utilities = w @ returns.T  # (candidates, n)
         nearest = np.abs(w[:, None] - preferences).sum(axis=-1).argmin(axis=1)
         return w[(utilities.max(axis=1) - utilities[np.arange(len(w)), nearest]).argmax()]
@@ -139,7 +141,8 @@ def make_sampler(spec: PreferenceSampler | SamplerSpec, n_objectives: int) -> Pr
     """A sampler from a literal, as configuration files write it; a callable is returned as it is.
 
     :param spec: "uniform"; "cone"; "gain"; weights to keep; or a dictionary with `name`, for "cone" the `angle` in degrees, for
-        "gain" its `candidates` and `memory`, for "fixed" the `preference`, and `per_step` for a new preference after every step
+        "gain" its `candidates` and `remembered_episodes`, for "fixed" the `preference`, and for all but "gain" `per_step`, a
+        new preference after every step
     :raises ValueError: for anything else
     """
     if callable(spec):

@@ -54,12 +54,14 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             )
         self.preference_dim = preference_dim(self.n_objectives)
         self.env_index = 0
+        self._played = np.zeros(
+            (0, 2, self.n_objectives)
+        )  # preference and return of the episodes that the sampler looks back on
         self.set_preference_sampler(preference_sampler)
         self._fixed_preference: np.ndarray | None = None
         self._preference: np.ndarray | None = None
         self._holds_for_episode = False
         self._rng = np.random.default_rng()
-        self._played = np.zeros((0, 2, self.n_objectives))  # preference and return of episodes, for a sampler with a memory
         self._episode_step = 0
         self._episode: dict[str, Any] = {"actions": None, "vector_return": np.zeros(self.n_objectives)}
 
@@ -92,6 +94,8 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         """
         own = sampler.var if isinstance(sampler, CloudpickleWrapper) else sampler
         self.preference_sampler: PreferenceSampler = make_sampler("uniform" if own is None else own, self.n_objectives)
+        self._n_remembered = int(getattr(self.preference_sampler, "remembered_episodes", 0))
+        self._played = self._played[max(0, len(self._played) - self._n_remembered) :]
 
     def set_env_index(self, index: int) -> None:
         """The environment's place in its VecEnv, for error messages."""
@@ -143,19 +147,14 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         vector_reward = self._check_reward(reward)
         self._episode["vector_return"] += vector_reward
         w = self._preference
-        if terminated or truncated:
-            self._remember(w, self._episode["vector_return"])
+        if (terminated or truncated) and self._n_remembered > 0:
+            self._played = np.concatenate([self._played, [[w, self._episode["vector_return"]]]])[-self._n_remembered :]
         # As long as the environment uses the same dict again, ours must be another one.
         info = {**info, "vector_reward": vector_reward, "preference": w.copy()}
         if self._fixed_preference is not None or getattr(self.preference_sampler, "per_step", False):
             if not self._holds_for_episode:
                 self._preference = self._next_preference()
         return self._observe(observation), float(np.dot(w, vector_reward)), terminated, truncated, info
-
-    def _remember(self, preference: np.ndarray, vector_return: np.ndarray) -> None:
-        memory = getattr(self.preference_sampler, "memory", 0)
-        if memory > 0:
-            self._played = np.concatenate([self._played, [[preference, vector_return]]])[-memory:]
 
     def _note_action(self, action: np.ndarray) -> None:
         """For a checkpoint in mid-episode, up to LONGEST_REPLAY of them."""
@@ -182,10 +181,12 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         }
 
     def begin_replay(self, state: dict[str, Any]) -> dict[str, Any]:
-        """Set the random numbers to those before an episode's reset; the arguments of that reset."""
+        """Set the random numbers, and the episodes that the sampler looks back on, to those before an episode's reset; the
+        arguments of that reset."""
         if state["env_rng"] is not None:
             self.np_random.bit_generator.state = state["env_rng"]
         self._rng.bit_generator.state = state["rng"]
+        self._played = np.asarray(state.get("played", self._played), dtype=np.float64)
         return {"seed": state["seed"], "options": state["options"]}
 
     def end_replay(self, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -194,14 +195,13 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._fixed_preference, self._preference = state["fixed_preference"], state["preference"]
         self._holds_for_episode = state["holds_for_episode"]
         self._rng.bit_generator.state = state["rng_now"]
-        self._played = state.get("played", self._played)
         return self._observe(self._observation), self._episode["vector_return"]
 
     def _next_preference(self) -> np.ndarray:
         if self._fixed_preference is not None:
             return self._fixed_preference.copy()
-        has_memory = getattr(self.preference_sampler, "memory", 0) > 0
-        drawn = self.preference_sampler(self._rng, *(self._played.swapaxes(0, 1) if has_memory else ()))
+        played = () if self._n_remembered == 0 else (self._played[:, 0], self._played[:, 1])
+        drawn = self.preference_sampler(self._rng, *played)
         try:
             return self._one_preference(drawn)
         except ValueError as error:

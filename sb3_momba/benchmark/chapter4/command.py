@@ -35,11 +35,12 @@ def write_chapter(records: Sequence[Record], folder: Path) -> str:
             "python -m sb3_momba.benchmark report compares records of any task."
         )
     folder.mkdir(parents=True, exist_ok=True)
-    for picture in folder.glob("figure-4.*.png"):  # What these records cannot draw is missing.
-        picture.unlink()
     parts = ["# Chapter 4 from records\n", EXPLANATION, *of_the_records(tasks, records)]
     for title, section in SECTIONS.items():
         parts += [f"## {title}\n", section(tasks, folder)]
+    for picture in folder.glob("figure-4.*.png"):
+        if not any(f"({picture.name})" in part for part in parts):  # of other records
+            picture.unlink()
     parts += [failures(list(tasks.values())), provenance(in_order(records))]
     text = "\n".join(part.rstrip("\n") + "\n" for part in parts if part)
     with atomic_write(folder / "chapter4.md") as file:
