@@ -62,12 +62,12 @@ def way_to_run(folder: Path, retry_failed: bool = False) -> Literal["begin", "go
     :raises OSError: if the disk is full, before the run fails on it
     """
     with alone_soon_in(folder):
-        free = shutil.disk_usage(folder).free
-        if free < LEAST_BYTES_FREE:
-            raise OSError(errno.ENOSPC, f"The disk is full, {free:,} bytes are left", str(folder))
         state = state_of(folder)
         if state == "finished" or (state == "failed" and not retry_failed):
             return None
+        free = shutil.disk_usage(folder).free
+        if free < LEAST_BYTES_FREE:
+            raise OSError(errno.ENOSPC, f"The disk is full, {free:,} bytes are left", str(folder))
         if state != "not begun":
             with contextlib.suppress(FileNotFoundError):
                 newest(folder / CHECKPOINTS)

@@ -54,9 +54,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             )
         self.preference_dim = preference_dim(self.n_objectives)
         self.env_index = 0
-        self._played = np.zeros(
-            (0, 2, self.n_objectives)
-        )  # preference and return of the episodes that the sampler looks back on
+        self._played = np.zeros((0, 2, self.n_objectives))  # preference and return of episodes that the sampler remembers
         self.set_preference_sampler(preference_sampler)
         self._fixed_preference: np.ndarray | None = None
         self._preference: np.ndarray | None = None
@@ -181,7 +179,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         }
 
     def begin_replay(self, state: dict[str, Any]) -> dict[str, Any]:
-        """Set the random numbers, and the episodes that the sampler looks back on, to those before an episode's reset; the
+        """Set the random numbers, and the episodes that the sampler remembers, to those before an episode's reset; the
         arguments of that reset."""
         if state["env_rng"] is not None:
             self.np_random.bit_generator.state = state["env_rng"]
