@@ -33,8 +33,7 @@ known-fronts: $(VENV)/tools
 
 first-records: $(VENV)/installed
 	$(BIN)/python -m sb3_momba.benchmark run --conf momba capql capql_uniform --env MO-HalfCheetah-v4 MO-Hopper-v4 \
-		--seeds 2 --steps 3e4 --eval-freq 5e3 --auto-ent-coef 0.01 --output runs/first
-	$(BIN)/python -m sb3_momba.benchmark report runs/first
+		--seeds 2 --steps 3e4 --eval-freq 5e3 --auto-ent-coef 0.01 --output runs/first --report
 
 EVIDENCE := --env MO-HalfCheetah-v4 MO-Hopper-v4 MO-Walker2d-v4 --seeds 4 --steps 5e4 --eval-freq 5e3
 
@@ -74,8 +73,7 @@ beyond: $(VENV)/installed
 # What each idea gives to it: 46 runs of some ten minutes of one core.
 ideas: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --grid ideas --env MO-HalfCheetah-v4 --seeds 2 --steps 3e4 \
-		--set precision=auto --set compile=true --output runs/ideas
-	$(BIN)/python -m sb3_momba.benchmark report runs/ideas
+		--set precision=auto --set compile=true --output runs/ideas --report
 
 # The ablations of chapter 4 in short, on one task, grid after grid, the dearest last: 72 runs, of which 34 cost a core half an hour
 # (AVX-512 with bfloat16), and those of more updates or wider critics a multiple.

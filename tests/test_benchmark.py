@@ -1479,9 +1479,10 @@ def test_a_grid_with_failures_ends_with_their_number(training, tmp_path) -> None
     arguments = ["--conf", "momba", "--env", ENV, "--seeds", "3", "--output", tmp_path, "--processes", "1"]
     for _ in range(2):
         training({0: "fails", 2: "fails"})
-        message = error_of("run", *arguments)
+        message = error_of("run", *arguments, "--report")
         assert "2 runs did not finish" in message
         assert str(tmp_path) in message
+        assert rows_of((tmp_path / "report.md").read_text(), "a")[0][1] == "1/3"  # the label of fake records
 
 
 def test_options_are_handed_on(training, tmp_path, monkeypatch) -> None:
@@ -1583,8 +1584,7 @@ def test_a_real_grid_of_one_run(tmp_path, monkeypatch, capsys) -> None:
     assert (folder / "model.zip").exists()
 
     put_in_place(monkeypatch, lambda command, log: pytest.fail("it is run again"))
-    main([*line.split(), *options.split()])
-    main(["report", str(tmp_path / "grid")])
+    main([*line.split(), *options.split(), "--report"])
     text = (tmp_path / "grid" / "report.md").read_text()
     assert rows_of(text, "tiny")[0][1:3] == ["1/1", "100"]
     assert text in capsys.readouterr().out

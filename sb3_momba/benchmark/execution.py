@@ -10,6 +10,7 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any, Literal
 
+from sb3_momba.benchmark import report
 from sb3_momba.benchmark.grid import Cell, checked
 from sb3_momba.benchmark.results import flat
 from sb3_momba.checkpoints.folders import newest
@@ -130,10 +131,12 @@ def failed(cells: Sequence[Cell], output: Path) -> dict[str, str]:
     return found
 
 
-def end_with_failures(failures: Mapping[str, str], output: Path) -> None:
-    """Print what did not finish, by name, and leave with an error if anything did not."""
+def end(failures: Mapping[str, str], output: Path, with_report: bool) -> None:
+    """Print what did not finish, by name, and the report if it is asked for; leave with an error if anything did not finish."""
     for name, text in failures.items():
         print(f"\n{name}\n{indent(text, '    ')}", file=sys.stderr)
+    if with_report:
+        report.tell(report.read_begun([output]), output)
     if failures:
         names = ", ".join(failures)
         sys.exit(

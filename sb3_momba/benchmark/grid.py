@@ -322,6 +322,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, help="how many, 0, 1, ...; by default the grid's")
     parser.add_argument("--output", type=Path, required=True, help="folder of the run folders")
     parser.add_argument("--retry-failed", action="store_true", help="run again what failed")
+    parser.add_argument("--report", action="store_true", help="at the end, the report of what lies in the output folder")
     parser.add_argument(
         "--auto-ent-coef", type=float, help="where every configuration that learns alpha starts it; 0.01 below 200,000 steps"
     )

@@ -121,4 +121,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(given: argparse.Namespace, options: Sequence[str]) -> None:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     failures = run_grid(grid.cells_of(given, options), given.output, given.processes, given.retry_failed)
-    execution.end_with_failures(failures, given.output)
+    execution.end(failures, given.output, given.report)

@@ -303,8 +303,13 @@ def read_begun(given: Sequence[Path]) -> list[Record]:
     return [read_record(path) for path in begun]
 
 
-def main(given: argparse.Namespace) -> None:
-    records = records_of(given)
-    folder = folder_of(given)
-    print(write_report(compare(records, given.reference_point), records, folder, given.baseline))
+def tell(
+    records: Sequence[Record], folder: Path, reference_point: Sequence[float] | None = None, baseline: str | None = None
+) -> None:
+    """Print the report of these records, and write it with its pictures into a folder."""
+    print(write_report(compare(records, reference_point), records, folder, baseline))
     print(f"Written to {folder / 'report.md'}.")
+
+
+def main(given: argparse.Namespace) -> None:
+    tell(records_of(given), folder_of(given), given.reference_point, given.baseline)

@@ -80,4 +80,4 @@ def main(given: argparse.Namespace, options: Sequence[str]) -> None:
         given.max_failures,
         given.retry_failed,
     )
-    execution.end_with_failures(failures, given.output)
+    execution.end(failures, given.output, given.report)
