@@ -258,14 +258,26 @@ def test_the_table_says_what_runs_where_and_how_far() -> None:
     watch = trials.Watch(5)
     watch.on_trial_complete(1, [], fake("ends well", "TERMINATED"))
     watch.on_trial_complete(1, [], fake("ends badly", "TERMINATED", error="Traceback\nValueError: nan"))
+    lost = fake("is lost", "ERROR")
+    for error in (None, "OutOfMemory: killed"):
+        lost.get_error = lambda error=error: error
+        watch.on_trial_error(1, [], lost)
+        assert watch.errors.pop("is lost") == "its process was lost 2 times" + (
+            f", the last time by:\n{error}" if error else ""
+        )
     running = fake("goes on", "RUNNING", node_ip="10.0.0.7", pid=4321, steps=12_000)
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(watch.table([running, fake("begins", "RUNNING"), fake("waits", "PENDING")]))
     said = " ".join(console.export_text().split())
-    assert "2 of 5 runs have ended, 1 failed" in said
+    assert "4 of 5 runs have ended, 1 failed" in said
     assert "goes on │ 10.0.0.7 │ 4321 │ 12,000 │ 30,000 │ 2" in said
     assert "begins" in said
     assert "waits" not in said
+    narrow = Console(width=60, record=True, file=io.StringIO())
+    narrow.print(watch.table([fake("value_simba_ce_vector/MO-Swimmer-v4/9", "RUNNING", node_ip="10.0.0.7", pid=4321)]))
+    assert "".join(line.split("│")[1].strip() for line in narrow.export_text().splitlines() if "│" in line) == (
+        "value_simba_ce_vector/MO-Swimmer-v4/9"
+    )
     assert watch.errors == {"ends badly": "Traceback\nValueError: nan"}
 
 
@@ -276,6 +288,7 @@ BAD = {
     "an address where nothing answers": (["--address", "127.0.0.1:9"], "No Ray cluster answers at 127.0.0.1:9"),
     "no workers": (["--workers", "0"], "workers=0"),
     "no threads": (["--threads", "0"], "threads=0"),
+    "more threads than processors": (["--threads", "999"], "threads=999: this machine has"),
     "less than no GPU": (["--gpus", "-1"], "gpus=-1"),
     "less than no failures": (["--max-failures", "-1"], "max_failures=-1"),
 }
@@ -306,6 +319,19 @@ def test_a_ray_that_does_not_start_is_one_line_of_error(tmp_path, monkeypatch) -
     monkeypatch.setattr(trials.ray, "init", is_too_slow)
     with pytest.raises(SystemExit, match=r"error: Ray did not start on this machine.* timed out during startup"):
         main(sweep_arguments(tmp_path))
+
+
+def test_sigterm_interrupts_a_sweep_as_ctrl_c_does(monkeypatch) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    ended = []
+    monkeypatch.setattr(trials.ray, "init", lambda **kwargs: signal.signal(signal.SIGTERM, lambda *of_the_signal: os.abort()))
+    monkeypatch.setattr(trials.ray, "shutdown", lambda: ended.append(True))
+    try:
+        with pytest.raises(KeyboardInterrupt), trials.cluster(None, 1, 1):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert ended
 
 
 def test_what_no_node_can_run_is_refused(tmp_path, monkeypatch) -> None:

@@ -2,8 +2,11 @@
 
 import contextlib
 import errno
+import logging
 import shutil
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +24,8 @@ from sb3_momba.zoo.configuration import with_later_settings
 
 LEAST_BYTES_FREE = 200_000_000  # of a disk, for a run to begin or go on: two checkpoints and a model of Momba's size
 SECONDS_FOR_A_LOCK = 120.0  # in which the process that has lost a cell notices it and ends
+
+logger = logging.getLogger(__name__)
 
 State = Literal["not begun", "cut off", "failed", "finished"]
 Runner = Callable[[Sequence[Cell], Mapping[str, Any]], dict[str, str]]
@@ -60,15 +65,13 @@ def way_to_run(folder: Path, retry_failed: bool = False) -> Literal["begin", "go
 
     :raises FolderInUseError: if a process that had lost the cell still writes into the folder after two minutes
     :raises FileFormatError: if there are checkpoints, and none can be read
-    :raises OSError: if the disk is full, before the run fails on it
+    :raises OSError: if the disk is full
     """
     with alone_soon_in(folder):
         state = state_of(folder)
         if state == "finished" or (state == "failed" and not retry_failed):
             return None
-        free = shutil.disk_usage(folder).free
-        if free < LEAST_BYTES_FREE:
-            raise OSError(errno.ENOSPC, f"The disk is full, {free:,} bytes are left", str(folder))
+        check_space(folder)
         if state != "not begun":
             with contextlib.suppress(FileNotFoundError):
                 newest(folder / CHECKPOINTS)
@@ -79,6 +82,13 @@ def way_to_run(folder: Path, retry_failed: bool = False) -> Literal["begin", "go
             elif path.name != LOCK:
                 path.unlink()
         return "begin"
+
+
+def check_space(folder: Path) -> None:
+    """:raises OSError: if the disk is full, before a run fails on it"""
+    free = shutil.disk_usage(folder).free
+    if free < LEAST_BYTES_FREE:
+        raise OSError(errno.ENOSPC, f"The disk is full, {free:,} bytes are left", str(folder))
 
 
 @contextlib.contextmanager
@@ -106,12 +116,29 @@ def run_cells(cells: Sequence[Cell], output: Path, runner: Runner, retry_failed:
     :raises ValueError: for settings that cannot be, a folder that holds something else or where another grid runs, before
         anything runs
     :raises gymnasium.error.Error: for an environment that does not exist, naming the nearest
+    :raises OSError: if the disk is full
     """
     settings = checked(cells, output)
     with alone_in(output):
         waiting = [cell for cell in cells if has_to_run(cell, settings[cell.name], retry_failed)]
+        logger.info("%d of %d runs have to run", len(waiting), len(cells))
+        if waiting:
+            check_space(output)
         said = runner(waiting, settings) if waiting else {}
         return {name: said.get(name, error) for name, error in failed(cells, output).items()}
+
+
+@contextlib.contextmanager
+def on_sigterm(handler: Callable[..., None]) -> Iterator[None]:
+    """Only the main thread can hear signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def log_of(folder: Path) -> Path:

@@ -4,14 +4,13 @@ A cell whose run ended, well or badly, is not run again; one that was cut off is
 """
 
 import argparse
-import contextlib
 import logging
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
@@ -56,19 +55,6 @@ class Trainings:
         raise KeyboardInterrupt
 
 
-@contextlib.contextmanager
-def ended_by_sigterm(trainings: Trainings) -> Iterator[None]:
-    """Only the main thread can hear signals."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, trainings.end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_failed: bool = False) -> dict[str, str]:
     """Run what has not ended yet: see `execution.run_cells`.
 
@@ -79,7 +65,7 @@ def run_grid(cells: Sequence[Cell], output: Path, processes: int = 2, retry_fail
 
     def side_by_side(waiting: Sequence[Cell], settings: Mapping[str, Any]) -> dict[str, str]:
         trainings = Trainings()
-        with ended_by_sigterm(trainings), ThreadPoolExecutor(processes) as pool:
+        with execution.on_sigterm(trainings.end), ThreadPoolExecutor(processes) as pool:
             try:
                 said = list(pool.map(lambda cell: _run_cell(cell, settings[cell.name], retry_failed, trainings), waiting))
             except BaseException:

@@ -49,7 +49,10 @@ def run_sweep(
     ):
         if value is not None and value < least:
             raise ValueError(f"{name}={value}: it must be at least {least}.")
-    n = workers or max(1, (os.cpu_count() or 1) // threads)
+    processors = os.cpu_count() or 1
+    if address is None and threads > processors:
+        raise ValueError(f"threads={threads}: this machine has {processors} processors.")
+    n = workers or processors // threads
 
     def on_ray(waiting: Sequence[Cell], settings: Mapping[str, Any]) -> dict[str, str]:
         with trials.cluster(address, n * threads, threads):

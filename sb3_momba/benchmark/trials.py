@@ -34,6 +34,7 @@ STATE = ".tune"  # Ray Tune's own files, in the output folder; nothing is read f
 OBJECT_STORE_BYTES = 100_000_000  # trials exchange a few numbers
 SECONDS_BETWEEN_REPORTS = 2.0
 SECONDS_FOR_AN_ADDRESS = 10.0
+ATTEMPTS_TO_CONNECT = "1"  # each takes 40 seconds where something else than Ray listens
 
 logger = logging.getLogger(__name__)
 
@@ -48,8 +49,10 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
     if address is None:
         arguments = {"address": "local", "num_cpus": processors, "object_store_memory": OBJECT_STORE_BYTES}
         arguments["include_dashboard"] = False
-    elif address != "auto":
-        _check_answers(address)
+    else:
+        os.environ.setdefault("RAY_gcs_server_port_wait_time_s", ATTEMPTS_TO_CONNECT)
+        if address != "auto":
+            _check_answers(address)
     try:
         ray.init(
             **arguments,
@@ -63,11 +66,20 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
                 f"Ray did not start on this machine: {error} Its logs lie in /tmp/ray/session_latest/logs. The half minute "
                 "that it has is too little where processors are busy: try later, or use `benchmark run`, which needs no Ray."
             ) from error
-        raise ConnectionError(f"Ray at {address!r} cannot be reached: {error}") from error
+        raise ConnectionError(
+            f"Ray at {address!r} cannot be reached: {error} Give the address that `ray start --head` printed, and use the same "
+            "version of Ray; if it asks for a token, this machine needs that of ~/.ray/auth_token there, or RAY_AUTH_TOKEN."
+        ) from error
     try:
-        yield
+        with execution.on_sigterm(_interrupt):
+            yield
     finally:
         ray.shutdown()
+
+
+def _interrupt(*of_the_signal: Any) -> None:
+    """What Ctrl-C does."""
+    raise KeyboardInterrupt
 
 
 def _check_answers(address: str) -> None:
@@ -192,7 +204,8 @@ class Watch(tune.Callback):
         self._end(trial, trial.last_result.get("error"))
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        self._end(trial, f"its process was lost {trial.num_failures} times, the last time by:\n{trial.get_error()}")
+        lost, error = f"its process was lost {trial.num_failures} times", trial.get_error()  # None where it was not tried again
+        self._end(trial, lost if error is None else f"{lost}, the last time by:\n{error}")
 
     def _end(self, trial: Trial, error: str | None) -> None:
         self.n_ended += 1
@@ -214,7 +227,7 @@ class Watch(tune.Callback):
         """Of the runs that have a process now."""
         table = Table(title=f"{self.n_ended} of {self.n_trials} runs have ended, {len(self.errors)} failed")
         for column in ("run", "node", "process", "steps", "of", "processes lost"):
-            table.add_column(column, justify="left" if column in ("run", "node") else "right")
+            table.add_column(column, justify="left" if column in ("run", "node") else "right", overflow="fold")
         for trial in trials:
             if trial.status == Trial.RUNNING:
                 result = trial.last_result
