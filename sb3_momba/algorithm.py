@@ -53,6 +53,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     preference_sampler: PreferenceSampler | SamplerSpec | None
     best_return_scale: float | None
     return_scaling: str
+    reward_centering: bool
     target_entropy: str | float
     deterministic_exploration: bool
     noise_repeat: int
@@ -106,6 +107,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             "vector_values": self.vector_values,
             "best_return_scale": self.best_return_scale,
             "return_scaling": self.return_scaling,
+            "reward_centering": self.reward_centering,
             "gamma": self.gamma,
         }
 
@@ -260,7 +262,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         observations = self._last_obs[:, : self.policy.observation_dim]
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
-        self.policy.return_scale.update(self.replay_buffer.latest_rewards, dones)
+        self.policy.observe_rewards(self.replay_buffer.latest_rewards, self.replay_buffer.latest_terminations, dones)
         if self.preference_alignment and self.preference_alignment != "positive":
             self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
 

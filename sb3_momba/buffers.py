@@ -191,6 +191,11 @@ class PreferenceReplayBuffer(ReplayBuffer):
         """Of the step stored last, (n_envs, n_objectives)."""
         return self.rewards[self.pos - 1]
 
+    @property
+    def latest_terminations(self) -> np.ndarray:
+        """Whether the step stored last ended an episode, and no time limit did, (n_envs,): 0 or 1."""
+        return self.dones[self.pos - 1] * (1 - self.timeouts[self.pos - 1])
+
     def end_episodes(self, indices: Sequence[int] | None = None) -> None:
         """Truncate the trajectories that are not finished, as when the environments are reset from outside.
 

@@ -59,6 +59,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
     :param best_return_scale: what the largest return seen is scaled to (section 3.4.1); None: rewards as they are
     :param return_scaling: "maximum": by the largest return alone; "deviation": by the returns' standard deviation, down to what
         keeps the largest at best_return_scale (SimbaV2's code; FlashSAC)
+    :param reward_centering: critics learn by how much returns exceed what the mean reward is worth for ever (Naik et al., 2024)
     :param ent_coef: alpha; "auto_0.2" learns it from 0.2, a number fixes it
     :param target_entropy: of the policy on [-1, 1], in nats; "auto": `-|A|`; "std_0.15": that of a Gaussian with this standard
         deviation in each dimension (FlashSAC)
@@ -114,6 +115,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         preference_alignment: bool | str = False,
         best_return_scale: float | None = 3.0,
         return_scaling: str = "maximum",
+        reward_centering: bool = False,
         ent_coef: str | float = "auto_0.2",
         target_entropy: str | float = "auto",
         ent_coef_learning_rate: float | None = None,
@@ -180,6 +182,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         self.deterministic_exploration = deterministic_exploration
         self.best_return_scale = best_return_scale
         self.return_scaling = return_scaling
+        self.reward_centering = reward_centering
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.ent_coef_learning_rate = ent_coef_learning_rate
@@ -272,10 +275,11 @@ class MOMBA(PreferenceConditionedAlgorithm):
     def _sample(self, batch_size: int) -> PreferenceReplayBufferSamples:
         """A minibatch, normalised with the statistics of this moment."""
         batch = self.replay_buffer.sample(batch_size)
+        rewards = self.policy.center(batch.rewards, batch.discounts * (1 - batch.dones))
         return batch._replace(
             observations=self.policy.normalize(batch.observations),
             next_observations=self.policy.normalize(batch.next_observations),
-            rewards=batch.rewards * self.policy.return_scale.factor,
+            rewards=rewards * self.policy.return_scale.factor,
         )
 
     def _critic_loss(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> tuple[th.Tensor, Metrics]:

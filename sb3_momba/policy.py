@@ -17,7 +17,7 @@ from sb3_momba.finite import all_finite
 from sb3_momba.formats import header, read_format
 from sb3_momba.nn.layers import project_weights
 from sb3_momba.nn.networks import Actor, Architecture, Critic
-from sb3_momba.nn.normalization import DeviationScale, ReturnScale, RunningStatistics
+from sb3_momba.nn.normalization import DeviationScale, ReturnScale, RewardCenter, RunningStatistics
 from sb3_momba.nn.values import DistributionalValue, ExpectedValue
 
 POLICY_FORMAT = "sb3_momba.policy"
@@ -34,11 +34,12 @@ class MombaPolicy(BasePolicy):
     :param lr_schedule: learning rate as a function of the remaining progress, 1 at the start
     :param actor_architecture: builds the actor's layers
     :param critic_architecture: builds the layers of each critic
-    :param n_objectives: injected by MOMBA, like the next five; see there
+    :param n_objectives: injected by MOMBA, like the next six; see there
     :param critic_loss: "ce" or "mse"
     :param vector_values: critics of the vector return
     :param best_return_scale: what the largest return seen is scaled to
     :param return_scaling: "maximum" or "deviation"
+    :param reward_centering: whether critics learn by how much returns exceed what the mean reward is worth
     :param gamma: discount of the returns that are scaled
     :param n_critics: size of the ensemble
     :param n_atoms: atoms of a return distribution (critic_loss="ce")
@@ -67,6 +68,7 @@ class MombaPolicy(BasePolicy):
         vector_values: bool = False,
         best_return_scale: float | None = 3.0,
         return_scaling: str = "maximum",
+        reward_centering: bool = False,
         gamma: float = 0.99,
         n_critics: int = 2,
         n_atoms: int = 101,
@@ -87,10 +89,12 @@ class MombaPolicy(BasePolicy):
         self.n_objectives = n_objectives
         self.preference_dim = preference_dim(n_objectives)
         self.observation_dim = int(observation_space.shape[0]) - self.preference_dim
+        self.vector_values = vector_values
         self.normalize_observations = normalize_observations
         self.normalize_weights = normalize_weights
 
         self.statistics = RunningStatistics(self.observation_dim)
+        self.reward_center = RewardCenter(n_objectives, gamma) if reward_centering else None
         if return_scaling == "deviation" and best_return_scale is not None:
             self.return_scale: ReturnScale = DeviationScale(best_return_scale, gamma, n_objectives)
         else:
@@ -129,6 +133,32 @@ class MombaPolicy(BasePolicy):
             return observations
         s, w = observations[:, : self.observation_dim], observations[:, self.observation_dim :]
         return th.cat([self.statistics(s), w], dim=-1)
+
+    def center(self, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
+        """What critics learn from, (batch, n_objectives), not scaled yet: see RewardCenter."""
+        return rewards if self.reward_center is None else self.reward_center(rewards, discounts)
+
+    def left_out(self, preferences: np.ndarray) -> np.ndarray:
+        """What the critics' values lack, in the units of the rewards: V of RewardCenter, (n, n_objectives), or w.V, (n, 1),
+        of critics of the scalarised return; zeros without it.
+
+        :param preferences: w, (n, n_objectives)
+        """
+        value = np.zeros(self.n_objectives) if self.reward_center is None else self.reward_center.value.cpu().numpy()
+        return np.broadcast_to(value, preferences.shape) if self.vector_values else (preferences @ value)[:, None]
+
+    def observe_rewards(self, rewards: np.ndarray, terminated: np.ndarray, dones: np.ndarray) -> None:
+        """Update the statistics of rewards and their returns with one step.
+
+        :param rewards: (n_envs, n_objectives)
+        :param terminated: where it ended an episode, but no time limit did, (n_envs,)
+        :param dones: where it ended an episode, (n_envs,)
+        """
+        if self.reward_center is not None:
+            self.reward_center.statistics.update(rewards)
+            discounts = th.as_tensor(self.reward_center.gamma * (1 - terminated), device=self.device)
+            rewards = self.center(th.as_tensor(rewards, device=self.device), discounts).cpu().numpy()
+        self.return_scale.update(rewards, dones)
 
     def project_weights(self) -> None:
         """Normalise the linear layers of actor and critics (Algorithm 1), unless weight normalisation is off."""

@@ -17,7 +17,7 @@ from sb3_momba.nn.speed import has_compiler
 from sb3_momba.policies import SHIPPED_POLICIES, MlpPolicy
 from sb3_momba.policy import MombaPolicy
 
-SWITCHES = ("vector_values", "her", "compile", "deterministic_exploration", "optimize_memory_usage")
+SWITCHES = ("vector_values", "reward_centering", "her", "compile", "deterministic_exploration", "optimize_memory_usage")
 # The least that they may be.
 WHOLE_NUMBERS = {"batch_size": 1, "buffer_size": 1, "learning_starts": 0, "n_steps": 1, "policy_delay": 1, "noise_repeat": 1}
 RANGES = {"gamma": (0, 1), "tau": (0, 1)}
@@ -33,7 +33,7 @@ BUFFER_ARGUMENTS = ("n_steps", "gamma", *HER_DEFAULTS, "seed", "handle_timeout_t
 
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
 POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")
-INJECTED = ("n_objectives", "critic_loss", "vector_values", "best_return_scale", "return_scaling", "gamma")
+INJECTED = ("n_objectives", "critic_loss", "vector_values", "best_return_scale", "return_scaling", "reward_centering", "gamma")
 NOT_FOR_USERS = {
     *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
     *INJECTED,
@@ -120,6 +120,15 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
     if model.preference_alignment and not model.vector_values:
         raise ValueError(
             f"preference_alignment={model.preference_alignment} needs the vector Q of eq. (3.21): set vector_values=True."
+        )
+    if model.reward_centering and model.preference_alignment:
+        raise ValueError(
+            f"reward_centering=True with preference_alignment={model.preference_alignment!r}: the cosine of eq. (3.21) needs "
+            "values as they are: choose one of both."
+        )
+    if model.reward_centering and model.gamma == 1:
+        raise ValueError(
+            "reward_centering=True with gamma=1: what a reward is worth for ever has no bound: take gamma below 1."
         )
     if model.noise_repeat > 1 and model.deterministic_exploration:
         raise ValueError(

@@ -10,7 +10,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from sb3_momba import MOMBA, MombaCheckpointCallback, buffers, make_mo_vec_env
 from sb3_momba.envs.preferences import corner_weights
 from sb3_momba.exploration import HeldNoise, td3_smoothed
-from sb3_momba.nn.normalization import DeviationScale
+from sb3_momba.nn.normalization import DeviationScale, RewardCenter
 from sb3_momba.policies import SHIPPED_POLICIES
 from sb3_momba.settings import parse_target_entropy
 from tests.stubs import TINY_SIMBA, StubEnv, tiny_model
@@ -246,6 +246,11 @@ def test_td3_has_no_entropy_in_its_targets():
         ({"replay_buffer_kwargs": {"corner_probability": 0.5}}, "corner_probability=0.5, where no preference is relabelled"),
         ({"her": True, "her_kwargs": {"n_relabels": 2, "keep_probability": 1.0}}, "n_relabels=2, where no"),
         ({"her": True, "replay_buffer_kwargs": {"n_relabels": 3}, "batch_size": 8}, "does not divide batch_size=8"),
+        (
+            {"reward_centering": True, "vector_values": True, "preference_alignment": "positive"},
+            "preference_alignment='positive'",
+        ),
+        ({"reward_centering": True, "gamma": 1.0}, "reward_centering=True with gamma=1"),
     ],
     ids=[
         "TD3 with entropy",
@@ -257,6 +262,8 @@ def test_td3_has_no_entropy_in_its_targets():
         "corners without HER",
         "relabels that all keep",
         "rows",
+        "cosines of centred values",
+        "centres without bound",
     ],
 )
 def test_what_would_be_ignored_is_refused(arguments, said):
@@ -405,6 +412,65 @@ def test_the_deviation_scales_a_training_and_is_saved(tmp_path):
         tiny_model(StubEnv(), return_scaling="deviation", best_return_scale=None)
     with pytest.raises(ValueError, match="return_scaling='mean' is not known"):
         tiny_model(StubEnv(), return_scaling="mean")
+
+
+# --------------------------------------------------------------------------------------------------- reward centring
+
+
+def seen_by_a_center() -> RewardCenter:
+    """Rewards (2, 0) and (4, 2), on average (3, 1), which are worth (6, 2) for ever with gamma = 0.5."""
+    center = RewardCenter(2, 0.5)
+    center.statistics.update(np.array([[2.0, 0.0], [4.0, 2.0]]))
+    return center
+
+
+def test_what_critics_learn_is_less_by_what_the_mean_reward_is_worth():
+    center = seen_by_a_center()
+    assert center.value.tolist() == [6, 2]
+    discounts = th.tensor([0.5, 0.25, 0.0])  # one step, two, the end
+    assert center(th.ones(3, 2), discounts).tolist() == [[-2, 0], [-3.5, -0.5], [-5, -1]]
+    # R + d Q for any Q is by V more than what becomes of it.
+    rewards, values = th.rand(3, 2), th.rand(3, 2)
+    without = rewards + discounts[:, None] * values
+    with_it = center(rewards, discounts) + discounts[:, None] * (values - center.value)
+    th.testing.assert_close(without - center.value, with_it, check_dtype=False)
+
+
+def test_the_end_of_an_episode_counts_for_the_scale_of_centred_returns():
+    """Rewards (2, 0), then (4, 2): the first lies 0 from its own mean; behind the second, where the episode ends, (6, 2) are
+    lacking for ever, behind a time limit half of them."""
+    for terminated, largest in ((1.0, 2.0), (0.0, 1.0)):
+        policy = tiny_model(StubEnv(), reward_centering=True, gamma=0.5).policy
+        policy.observe_rewards(np.array([[2.0, 0.0]]), np.array([0.0]), np.array([False]))
+        assert policy.return_scale.factor == 1
+        policy.observe_rewards(np.array([[4.0, 2.0]]), np.array([terminated]), np.array([True]))
+        assert policy.return_scale.factor == pytest.approx(3 / largest)
+
+
+@pytest.mark.parametrize(("ending", "worth"), [("terminated", 1), ("truncated", 2)])
+@pytest.mark.parametrize("vector", [True, False], ids=["vector", "scalarised"])
+def test_centred_critics_learn_the_values_that_others_learn(ending, worth, vector):
+    """(1, 3) at the only step of an episode: worth that, or with gamma = 0.5 twice as much where a time limit cuts it off."""
+    kwargs = {"gamma": 0.5, "vector_values": vector, "critic_loss": "mse", "ent_coef": 0.0, "learning_rate": 3e-3, "tau": 0.1}
+    env = StubEnv(episode_length=1, ending=ending, rewards={t: np.array([1.0, 3.0]) for t in range(1_000)})
+    model = tiny_model(env, reward_centering=True, **kwargs).learn(400)
+    batch = model.replay_buffer.sample(200)
+    with th.no_grad():
+        q = model.policy.value.mean(model.critic(model.policy.normalize(batch.observations), batch.actions)).mean(dim=1).numpy()
+    w = batch.preferences.numpy()
+    values = q / model.policy.return_scale.factor + model.policy.left_out(w)
+    expected = worth * (np.array([[1.0, 3.0]]) if vector else w @ np.array([[1.0], [3.0]]))
+    assert np.abs(values - expected).mean() < 0.15
+
+
+def test_the_center_is_saved(tmp_path):
+    model = tiny_model(StubEnv(), reward_centering=True).learn(60)
+    model.save(tmp_path / "model")
+    loaded = MOMBA.load(tmp_path / "model").policy
+    assert float(loaded.reward_center.statistics.count) == 60
+    assert th.equal(loaded.reward_center.value, model.policy.reward_center.value)
+    assert loaded.left_out(np.array([[1.0, 0.0]])).shape == (1, 1)
+    assert not tiny_model(StubEnv()).policy.left_out(np.eye(2)).any()
 
 
 # -------------------------------------------------------------------------------------------------------- all of it

@@ -651,7 +651,7 @@ def test_predicted_distributions_by_hand(one_step, vector: bool) -> None:
     state = th.get_rng_state()
     atoms, probabilities = predicted(model, np.zeros((3, 3), np.float32))
     assert th.equal(th.get_rng_state(), state)
-    np.testing.assert_allclose(atoms, np.arange(-10, 11, 2))
+    np.testing.assert_allclose(atoms, [np.arange(-10, 11, 2)] * n_values)
     np.testing.assert_allclose(probabilities, [[0, 0.5, 0.5, *[0] * 8]] * n_values, atol=1e-12)
 
 

@@ -77,6 +77,7 @@ VARIANTS = {
     },
     "held noise, a delayed actor, three environments": {
         **{"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15", "return_scaling": "deviation", "n_envs": 3},
+        "reward_centering": True,
     },
     "corner weights and gains, two environments": {
         "her": True,

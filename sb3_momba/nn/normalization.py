@@ -52,6 +52,37 @@ class RunningStatistics(nn.Module):
         return (observations - self.mean.float()) * self.inverse_deviation
 
 
+class RewardCenter(nn.Module):
+    """Reward centring (Naik et al., 2024): critics learn Q - V, by how much a return is more than V = r / (1 - gamma), what
+    the mean reward r of all steps so far is worth for ever.
+
+    Its best actions are those of Q, as V is the same everywhere; at the end of an episode it is -V. What all values have in
+    common need not be learned, and what is left is scaled up.
+
+    :param n_objectives: width of the rewards
+    :param gamma: discount, below 1
+    """
+
+    def __init__(self, n_objectives: int, gamma: float):
+        super().__init__()
+        self.gamma = gamma
+        self.statistics = RunningStatistics(n_objectives)
+
+    @property
+    def value(self) -> th.Tensor:
+        """V, (n_objectives,), float64."""
+        return self.statistics.mean / (1 - self.gamma)
+
+    def forward(self, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
+        """Of R + d Q the R that makes it Q - V: R + d (Q - V) - V + d V.
+
+        :param rewards: R, sums of one or several rewards, (batch, n_objectives)
+        :param discounts: d of what follows, 0 where an episode ends, (batch,)
+        :return: (batch, n_objectives)
+        """
+        return rewards - self.value.to(rewards.dtype) * (1 - discounts[:, None])
+
+
 class ReturnScale(nn.Module):
     """Rewards are multiplied by best_return_scale / max |G_i|, the largest running return of any objective so far (reward
     normalisation, section 3.4.1).

@@ -69,8 +69,8 @@ def reset_observations(env: str, preference: ArrayLike, n_episodes: int, seed: i
 
 
 def predicted(model: MOMBA, observations: Array, seed: int = 0) -> tuple[Array, Array]:
-    """Atoms in the environment's units, (n_atoms,), and their probabilities, (n_values, n_atoms): the mean over the critics,
-    and over the observations with an action of the policy at each.
+    """Atoms in the environment's units, (n_values, n_atoms), and their probabilities, (n_values, n_atoms): the mean over the
+    critics, and over the observations with an action of the policy at each.
 
     :param observations: raw [s, w], (batch, observation_dim + n_objectives)
     """
@@ -81,8 +81,8 @@ def predicted(model: MOMBA, observations: Array, seed: int = 0) -> tuple[Array, 
         inputs = policy.normalize(th.as_tensor(observations, device=model.device))
         logits = policy.critic(inputs, policy.actor(inputs))
     probabilities = logits.double().softmax(dim=-1).mean(dim=(0, 1))
-    atoms = value.support.double() / policy.return_scale.factor
-    return atoms.cpu().numpy(), probabilities.cpu().numpy()
+    atoms = (value.support.double() / policy.return_scale.factor).cpu().numpy()
+    return atoms + policy.left_out(observations[:1, policy.observation_dim :]).T, probabilities.cpu().numpy()
 
 
 def distributions(model: MOMBA, env: str, front: ParetoFront, seed: int = 0) -> list[list[Distribution]]:
@@ -92,7 +92,7 @@ def distributions(model: MOMBA, env: str, front: ParetoFront, seed: int = 0) -> 
         atoms, probabilities = predicted(model, reset_observations(env, w, len(returns), seed), seed)
         samples = returns.T if model.vector_values else (returns @ w)[None]
         names = [f"objective {i + 1}" for i in range(len(w))] if model.vector_values else ["scalarised"]
-        found.append([Distribution(*one) for one in zip(names, [atoms] * len(names), probabilities, samples, strict=True)])
+        found.append([Distribution(*one) for one in zip(names, atoms, probabilities, samples, strict=True)])
     return found
 
 
