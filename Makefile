@@ -70,7 +70,7 @@ beyond: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run $(BEYOND) --env MO-HalfCheetah-v4 --seeds 2 --steps 5e4 --output runs/beyond/halfcheetah
 	$(BIN)/python -m sb3_momba.benchmark report docs/results/evidence runs/beyond --output runs/beyond
 
-# What each idea gives to it: 46 runs of some ten minutes of one core.
+# What each idea gives to it: 50 runs of some ten minutes of one core.
 ideas: $(VENV)/installed
 	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --grid ideas --env MO-HalfCheetah-v4 --seeds 2 --steps 3e4 \
 		--set precision=auto --set compile=true --output runs/ideas --report

@@ -194,7 +194,10 @@ class PreferenceReplayBuffer(ReplayBuffer):
     @property
     def latest_terminations(self) -> np.ndarray:
         """Whether the step stored last ended an episode, and no time limit did, (n_envs,): 0 or 1."""
-        return self.dones[self.pos - 1] * (1 - self.timeouts[self.pos - 1])
+        return self._terminations(self.pos - 1)
+
+    def _terminations(self, *index: Any) -> np.ndarray:
+        return self.dones[index] * (1 - self.timeouts[index])
 
     def end_episodes(self, indices: Sequence[int] | None = None) -> None:
         """Truncate the trajectories that are not finished, as when the environments are reset from outside.
@@ -265,7 +268,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         appended = preferences[:, : self.preference_dim]
         observations = self.observations[batch_inds, env_inds]
         next_observations = self.next_observations[last_inds, env_inds]
-        terminated = self.dones[last_inds, env_inds] * (1 - self.timeouts[last_inds, env_inds])
+        terminated = self._terminations(last_inds, env_inds)
         arrays = PreferenceReplayBufferSamples(
             observations=np.concatenate([observations, appended], axis=1),  # type: ignore[arg-type]
             actions=self.actions[batch_inds, env_inds],  # type: ignore[arg-type]

@@ -40,7 +40,7 @@ class MombaPolicy(BasePolicy):
     :param best_return_scale: what the largest return seen is scaled to
     :param return_scaling: "maximum" or "deviation"
     :param reward_centering: whether critics learn by how much returns exceed what the mean reward is worth
-    :param gamma: discount of the returns that are scaled
+    :param gamma: discount of the returns that are scaled, and of what the mean reward is worth
     :param n_critics: size of the ensemble
     :param n_atoms: atoms of a return distribution (critic_loss="ce")
     :param support: first and last atom, in scaled returns
@@ -138,15 +138,6 @@ class MombaPolicy(BasePolicy):
         """What critics learn from, (batch, n_objectives), not scaled yet: see RewardCenter."""
         return rewards if self.reward_center is None else self.reward_center(rewards, discounts)
 
-    def left_out(self, preferences: np.ndarray) -> np.ndarray:
-        """What the critics' values lack, in the units of the rewards: V of RewardCenter, (n, n_objectives), or w.V, (n, 1),
-        of critics of the scalarised return; zeros without it.
-
-        :param preferences: w, (n, n_objectives)
-        """
-        value = np.zeros(self.n_objectives) if self.reward_center is None else self.reward_center.value.cpu().numpy()
-        return np.broadcast_to(value, preferences.shape) if self.vector_values else (preferences @ value)[:, None]
-
     def observe_rewards(self, rewards: np.ndarray, terminated: np.ndarray, dones: np.ndarray) -> None:
         """Update the statistics of rewards and their returns with one step.
 
@@ -155,10 +146,26 @@ class MombaPolicy(BasePolicy):
         :param dones: where it ended an episode, (n_envs,)
         """
         if self.reward_center is not None:
-            self.reward_center.statistics.update(rewards)
-            discounts = th.as_tensor(self.reward_center.gamma * (1 - terminated), device=self.device)
-            rewards = self.center(th.as_tensor(rewards, device=self.device), discounts).cpu().numpy()
+            self.reward_center.update(rewards, terminated)
+            # In float64: rounding must not become the largest return.
+            rewards64, ended = (th.as_tensor(x, dtype=th.float64, device=self.device) for x in (rewards, terminated))
+            rewards = self.reward_center(rewards64, self.reward_center.gamma * (1 - ended)).cpu().numpy()
+            if self.reward_center.has_terminated:  # What follows an end is worth today's -V, in old transitions too.
+                self.return_scale.raise_to(float(self.reward_center.value.abs().max()))
         self.return_scale.update(rewards, dones)
+
+    def in_reward_units(self, values: np.ndarray, preferences: np.ndarray) -> np.ndarray:
+        """Values as critics have them in the units of the rewards: no longer scaled, nor lacking the V of RewardCenter.
+
+        :param values: (n, n_objectives), or (n, 1) of critics of the scalarised return
+        :param preferences: w, (n, n_objectives)
+        :return: of the shape of the values
+        """
+        values = values / self.return_scale.factor
+        if self.reward_center is None:
+            return values
+        lacking = self.reward_center.value.cpu().numpy()
+        return values + (lacking if self.vector_values else (preferences @ lacking)[:, None])
 
     def project_weights(self) -> None:
         """Normalise the linear layers of actor and critics (Algorithm 1), unless weight normalisation is off."""

@@ -1556,13 +1556,20 @@ def test_sigterm_ends_the_trainings_with_their_grid(tmp_path, monkeypatch, capsy
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_nothing_begins_on_a_full_disk(training, tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("free", "said"),
+    [([1_000], "The disk is full, 1,000 bytes are left"), ([10**10, 1_000, 1_000], "2 runs did not finish")],
+    ids=["before anything", "meanwhile"],
+)
+def test_nothing_begins_on_a_full_disk(training, tmp_path, monkeypatch, free: list[int], said: str) -> None:
     fake_training = training()
     cells = make_cells(["momba"], [ENV], 2)
     with monkeypatch.context() as patch:
-        patch.setattr(execution.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1_000))
-        message = error_of("run", "--conf", "momba", "--env", ENV, "--seeds", "2", "--output", tmp_path)
-    assert "2 runs did not finish" in message
+        left = iter(free)
+        patch.setattr(execution.shutil, "disk_usage", lambda folder: SimpleNamespace(free=next(left)))
+        message = error_of("run", "--conf", "momba", "--env", ENV, "--seeds", "2", "--output", tmp_path, "--report")
+    assert said in message
+    assert ("There is no report" in message) == (len(free) > 1)
     assert fake_training.seeds == []
     assert execution.failed(cells, tmp_path) == {cell.name: "no record: it never began" for cell in cells}
     assert run_grid(cells, tmp_path) == {}

@@ -437,40 +437,63 @@ def test_what_critics_learn_is_less_by_what_the_mean_reward_is_worth():
 
 
 def test_the_end_of_an_episode_counts_for_the_scale_of_centred_returns():
-    """Rewards (2, 0), then (4, 2): the first lies 0 from its own mean; behind the second, where the episode ends, (6, 2) are
-    lacking for ever, behind a time limit half of them."""
-    for terminated, largest in ((1.0, 2.0), (0.0, 1.0)):
+    """Rewards (2, 0), then (4, 2), whose means are (2, 0) and (3, 1), worth (4, 0) and (6, 2). Behind a time limit G is (0, 0)
+    and (4 - 3, 2 - 1); what follows a true end is worth -(6, 2), and later minus what the mean is worth then."""
+    for terminated, largest in ((0.0, 1.0), (1.0, 6.0)):
         policy = tiny_model(StubEnv(), reward_centering=True, gamma=0.5).policy
         policy.observe_rewards(np.array([[2.0, 0.0]]), np.array([0.0]), np.array([False]))
         assert policy.return_scale.factor == 1
         policy.observe_rewards(np.array([[4.0, 2.0]]), np.array([terminated]), np.array([True]))
         assert policy.return_scale.factor == pytest.approx(3 / largest)
+    policy.observe_rewards(np.array([[9.0, 1.0]]), np.array([0.0]), np.array([False]))  # The mean is (5, 1).
+    assert policy.return_scale.factor == pytest.approx(3 / 10)
 
 
-@pytest.mark.parametrize(("ending", "worth"), [("terminated", 1), ("truncated", 2)])
+def test_equal_rewards_leave_no_rounding_to_be_scaled_up():
+    policy = tiny_model(StubEnv(n_objectives=1), reward_centering=True).policy
+    for _ in range(300):
+        policy.observe_rewards(np.full((2, 1), -0.1, dtype=np.float32), np.zeros(2, dtype=np.float32), np.zeros(2, dtype=bool))
+    assert policy.return_scale.factor == 1
+
+
+@pytest.mark.parametrize(("ending", "n_steps"), [("terminated", 1), ("terminated", 3), ("truncated", 1), ("truncated", 3)])
 @pytest.mark.parametrize("vector", [True, False], ids=["vector", "scalarised"])
-def test_centred_critics_learn_the_values_that_others_learn(ending, worth, vector):
-    """(1, 3) at the only step of an episode: worth that, or with gamma = 0.5 twice as much where a time limit cuts it off."""
-    kwargs = {"gamma": 0.5, "vector_values": vector, "critic_loss": "mse", "ent_coef": 0.0, "learning_rate": 3e-3, "tau": 0.1}
-    env = StubEnv(episode_length=1, ending=ending, rewards={t: np.array([1.0, 3.0]) for t in range(1_000)})
-    model = tiny_model(env, reward_centering=True, **kwargs).learn(400)
+def test_centred_critics_learn_the_values_that_others_learn(ending, n_steps, vector):
+    """(1, 3), then (5, 1), with gamma = 0.5: (3.5, 3.5) and (5, 1) where episodes end after two steps. Where a time limit cuts
+    what would go on in turns, (1, 3) comes with 1 / (1 - 1/4) of (3.5, 3.5), (5, 1) with as much of (5.5, 2.5)."""
+    rewards = {t: np.array([1.0, 3.0] if t % 2 == 1 else [5.0, 1.0]) for t in range(2_000)}
+    observations = {t: np.full(3, t % 2, dtype=np.float32) for t in range(2_000)}
+    env = StubEnv(episode_length=2, ending=ending, rewards=rewards, observations=observations)
+    settings = {"gamma": 0.5, "n_steps": n_steps, "vector_values": vector, "critic_loss": "mse", "ent_coef": 0.0}
+    model = tiny_model(env, reward_centering=True, learning_rate=3e-3, tau=0.1, **settings).learn(600)
     batch = model.replay_buffer.sample(200)
     with th.no_grad():
         q = model.policy.value.mean(model.critic(model.policy.normalize(batch.observations), batch.actions)).mean(dim=1).numpy()
     w = batch.preferences.numpy()
-    values = q / model.policy.return_scale.factor + model.policy.left_out(w)
-    expected = worth * (np.array([[1.0, 3.0]]) if vector else w @ np.array([[1.0], [3.0]]))
-    assert np.abs(values - expected).mean() < 0.15
+    first, second = ([3.5, 3.5], [5, 1]) if ending == "terminated" else ([14 / 3, 14 / 3], [22 / 3, 10 / 3])
+    expected = np.where(batch.observations[:, :1].numpy() == 0, first, second)
+    error = model.policy.in_reward_units(q, w) - (expected if vector else (expected * w).sum(axis=1, keepdims=True))
+    assert np.abs(error).mean() < 0.3
 
 
 def test_the_center_is_saved(tmp_path):
-    model = tiny_model(StubEnv(), reward_centering=True).learn(60)
+    model = tiny_model(StubEnv(ending="terminated"), reward_centering=True).learn(60)
     model.save(tmp_path / "model")
     loaded = MOMBA.load(tmp_path / "model").policy
     assert float(loaded.reward_center.statistics.count) == 60
+    assert loaded.reward_center.has_terminated
     assert th.equal(loaded.reward_center.value, model.policy.reward_center.value)
-    assert loaded.left_out(np.array([[1.0, 0.0]])).shape == (1, 1)
-    assert not tiny_model(StubEnv()).policy.left_out(np.eye(2)).any()
+
+
+@pytest.mark.parametrize("vector", [True, False], ids=["vector", "scalarised"])
+def test_values_in_the_units_of_the_rewards_by_hand(vector):
+    """V = (6, 2), and rewards were halved."""
+    policy = tiny_model(StubEnv(), vector_values=vector, reward_centering=True, gamma=0.5).policy
+    policy.reward_center = seen_by_a_center()
+    policy.return_scale.max_return.fill_(6.0)
+    w = np.array([[0.5, 0.5], [0.25, 0.75]])
+    values = np.array([[1.0, 2.0], [3.0, 4.0]]) if vector else np.array([[1.0], [2.0]])
+    assert policy.in_reward_units(values, w).tolist() == ([[8, 6], [12, 10]] if vector else [[6], [7]])
 
 
 # -------------------------------------------------------------------------------------------------------- all of it

@@ -639,19 +639,24 @@ def test_reset_observations_are_those_of_the_episodes_with_the_preference_last(o
     np.testing.assert_array_equal(found, [[start, 0.25, 0.75] for start in np.float32(starts)])
 
 
+@pytest.mark.parametrize("centering", [False, True], ids=["", "centred"])
 @pytest.mark.parametrize("vector", [False, True], ids=["scalarised", "vector"])
-def test_predicted_distributions_by_hand(one_step, vector: bool) -> None:
-    """Of one critic with all its mass, softmax of 40 against 0, on the second atom, and one with it on the third."""
-    model = tiny_model(one_step, vector_values=vector)
+def test_predicted_distributions_by_hand(one_step, vector: bool, centering: bool) -> None:
+    """Of one critic with all its mass, softmax of 40 against 0, on the second atom, and one with it on the third. A mean
+    reward of (3, 1) is worth (6, 2), to w = (0.5, 0.5) 4."""
+    model = tiny_model(one_step, vector_values=vector, reward_centering=centering, gamma=0.5)
+    if centering:
+        model.policy.reward_center.statistics.mean.copy_(th.tensor([3.0, 1.0]))
     model.policy.return_scale.max_return.fill_(6.0)  # Rewards are halved.
     n_values = 2 if vector else 1
     logits = th.zeros(3, 2, n_values, 11)
     logits[:, 0, :, 1] = logits[:, 1, :, 2] = 40.0
     model.policy.critic.forward = lambda observations, actions: logits
     state = th.get_rng_state()
-    atoms, probabilities = predicted(model, np.zeros((3, 3), np.float32))
+    atoms, probabilities = predicted(model, np.array([[0.0, 0.5, 0.5]] * 3, np.float32))
     assert th.equal(th.get_rng_state(), state)
-    np.testing.assert_allclose(atoms, [np.arange(-10, 11, 2)] * n_values)
+    lacking = np.array([[6], [2]] if vector else [[4]]) * centering
+    np.testing.assert_allclose(atoms, [np.arange(-10, 11, 2)] * n_values + lacking)
     np.testing.assert_allclose(probabilities, [[0, 0.5, 0.5, *[0] * 8]] * n_values, atol=1e-12)
 
 

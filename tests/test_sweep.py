@@ -334,6 +334,19 @@ def test_sigterm_interrupts_a_sweep_as_ctrl_c_does(monkeypatch) -> None:
     assert ended
 
 
+def test_how_long_to_wait_for_a_cluster_does_not_stay_in_the_environment(monkeypatch) -> None:
+    name, value = trials.ATTEMPTS
+    seen = []
+    monkeypatch.setattr(trials.ray, "init", lambda **kwargs: seen.append(os.environ.get(name)))
+    monkeypatch.setattr(trials.ray, "shutdown", lambda: None)
+    for before, address in ((None, None), (None, "auto"), ("7", "auto")):
+        if before is not None:
+            monkeypatch.setenv(name, before)
+        with trials.cluster(address, 1, 1):
+            assert os.environ.get(name) == before
+    assert seen == [None, value, "7"]
+
+
 def test_what_no_node_can_run_is_refused(tmp_path, monkeypatch) -> None:
     nodes = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": False, "Resources": {"CPU": 16.0, "GPU": 1.0}}]
     monkeypatch.setattr(trials.ray, "nodes", lambda: nodes)

@@ -5,15 +5,12 @@ import errno
 import logging
 import shutil
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from textwrap import indent
 from typing import Any, Literal
 
-from sb3_momba.benchmark import report
 from sb3_momba.benchmark.grid import Cell, checked
 from sb3_momba.benchmark.results import flat
 from sb3_momba.checkpoints.folders import newest
@@ -130,7 +127,7 @@ def run_cells(cells: Sequence[Cell], output: Path, runner: Runner, retry_failed:
 
 @contextlib.contextmanager
 def on_sigterm(handler: Callable[..., None]) -> Iterator[None]:
-    """Only the main thread can hear signals."""
+    """Inside, what SIGTERM does; only in the main thread, as others cannot hear signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -156,17 +153,3 @@ def failed(cells: Sequence[Cell], output: Path) -> dict[str, str]:
             record = read_record(output / cell.name / FILE_NAME)
             found[cell.name] = (record.traceback or str(record.error)).rstrip()
     return found
-
-
-def end(failures: Mapping[str, str], output: Path, with_report: bool) -> None:
-    """Print what did not finish, by name, and the report if it is asked for; leave with an error if anything did not finish."""
-    for name, text in failures.items():
-        print(f"\n{name}\n{indent(text, '    ')}", file=sys.stderr)
-    if with_report:
-        report.tell(report.read_begun([output]), output)
-    if failures:
-        names = ", ".join(failures)
-        sys.exit(
-            f"error: {len(failures)} runs did not finish ({names}); their logs lie beside their folders in {output}. The same "
-            "command goes on with what was cut off or never began, and with --retry-failed with what failed."
-        )

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sb3_momba.benchmark import execution, grid
+from sb3_momba.benchmark.ending import end
 from sb3_momba.benchmark.grid import Cell
 from sb3_momba.files import FileFormatError, FolderInUseError
 
@@ -107,4 +108,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(given: argparse.Namespace, options: Sequence[str]) -> None:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     failures = run_grid(grid.cells_of(given, options), given.output, given.processes, given.retry_failed)
-    execution.end(failures, given.output, given.report)
+    end(failures, given.output, given.report)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_momba.benchmark import execution, grid
+from sb3_momba.benchmark.ending import end
 from sb3_momba.benchmark.grid import Cell
 
 
@@ -83,4 +84,4 @@ def main(given: argparse.Namespace, options: Sequence[str]) -> None:
         given.max_failures,
         given.retry_failed,
     )
-    execution.end(failures, given.output, given.report)
+    end(failures, given.output, given.report)

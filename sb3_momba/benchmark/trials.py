@@ -34,7 +34,8 @@ STATE = ".tune"  # Ray Tune's own files, in the output folder; nothing is read f
 OBJECT_STORE_BYTES = 100_000_000  # trials exchange a few numbers
 SECONDS_BETWEEN_REPORTS = 2.0
 SECONDS_FOR_AN_ADDRESS = 10.0
-ATTEMPTS_TO_CONNECT = "1"  # each takes 40 seconds where something else than Ray listens
+# Attempts to reach a cluster, each of 40 seconds where something else than Ray listens; of a head, seconds to start in.
+ATTEMPTS = ("RAY_gcs_server_port_wait_time_s", "1")
 
 logger = logging.getLogger(__name__)
 
@@ -49,10 +50,19 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
     if address is None:
         arguments = {"address": "local", "num_cpus": processors, "object_store_memory": OBJECT_STORE_BYTES}
         arguments["include_dashboard"] = False
-    else:
-        os.environ.setdefault("RAY_gcs_server_port_wait_time_s", ATTEMPTS_TO_CONNECT)
-        if address != "auto":
-            _check_answers(address)
+    elif address != "auto":
+        _check_answers(address)
+    with execution.on_sigterm(_interrupt):
+        with _environment(*ATTEMPTS) if address is not None else contextlib.nullcontext():
+            _init(address, arguments, threads)
+        try:
+            with execution.on_sigterm(_interrupt):  # Ray has put its own handler in place.
+                yield
+        finally:
+            ray.shutdown()
+
+
+def _init(address: str | None, arguments: Mapping[str, Any], threads: int) -> None:
     try:
         ray.init(
             **arguments,
@@ -70,11 +80,17 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
             f"Ray at {address!r} cannot be reached: {error} Give the address that `ray start --head` printed, and use the same "
             "version of Ray; if it asks for a token, this machine needs that of ~/.ray/auth_token there, or RAY_AUTH_TOKEN."
         ) from error
+
+
+@contextlib.contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    before = os.environ.get(name)
+    os.environ[name] = before or value
     try:
-        with execution.on_sigterm(_interrupt):
-            yield
+        yield
     finally:
-        ray.shutdown()
+        if before is None:
+            del os.environ[name]
 
 
 def _interrupt(*of_the_signal: Any) -> None:

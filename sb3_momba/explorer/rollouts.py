@@ -115,4 +115,4 @@ def critic_values(model: MOMBA, starts: Array32, preferences: NDArray[Any]) -> A
     s = model.policy.normalize(th.from_numpy(pairs))
     q = model.policy.value.mean(model.critic(s, model.actor(s, deterministic=True)))  # (n E, n_critics, n_objectives)
     expected = q.double().mean(dim=1).numpy().reshape(n, n_starts, -1).mean(axis=1)
-    return np.asarray(expected / model.policy.return_scale.factor + model.policy.left_out(preferences))
+    return model.policy.in_reward_units(expected, preferences)

@@ -56,17 +56,28 @@ class RewardCenter(nn.Module):
     """Reward centring (Naik et al., 2024): critics learn Q - V, by how much a return is more than V = r / (1 - gamma), what
     the mean reward r of all steps so far is worth for ever.
 
-    Its best actions are those of Q, as V is the same everywhere; at the end of an episode it is -V. What all values have in
-    common need not be learned, and what is left is scaled up.
+    Its best actions are those of Q, as V is the same everywhere; what follows the end of an episode is worth -V. What all
+    values have in common need not be learned. Where no episode ends but by a time limit, what is left is also scaled up.
 
     :param n_objectives: width of the rewards
     :param gamma: discount, below 1
     """
 
+    has_terminated: th.Tensor
+
     def __init__(self, n_objectives: int, gamma: float):
         super().__init__()
         self.gamma = gamma
         self.statistics = RunningStatistics(n_objectives)
+        self.register_buffer("has_terminated", th.zeros((), dtype=th.bool))
+
+    def update(self, rewards: np.ndarray, terminated: np.ndarray) -> None:
+        """
+        :param rewards: (n_envs, n_objectives)
+        :param terminated: where an episode has just ended, but by no time limit, (n_envs,)
+        """
+        self.statistics.update(rewards)
+        self.has_terminated |= bool(terminated.any())
 
     @property
     def value(self) -> th.Tensor:
@@ -116,7 +127,11 @@ class ReturnScale(nn.Module):
 
     def observe(self, returns: np.ndarray) -> None:
         """:param returns: G of every environment at this step, (n_envs, n_objectives)"""
-        self.max_return.fill_(max(float(self.max_return), float(np.abs(returns).max())))
+        self.raise_to(float(np.abs(returns).max()))
+
+    def raise_to(self, largest: float) -> None:
+        """The largest return is at least that."""
+        self.max_return.fill_(max(float(self.max_return), largest))
 
     def end_episodes(self, indices: Sequence[int] | None = None) -> None:
         """The next rewards begin new returns, in any number of environments.

@@ -72,7 +72,7 @@ def predicted(model: MOMBA, observations: Array, seed: int = 0) -> tuple[Array, 
     """Atoms in the environment's units, (n_values, n_atoms), and their probabilities, (n_values, n_atoms): the mean over the
     critics, and over the observations with an action of the policy at each.
 
-    :param observations: raw [s, w], (batch, observation_dim + n_objectives)
+    :param observations: raw [s, w], all of one w, (batch, observation_dim + n_objectives)
     """
     policy, value = model.policy, model.policy.value
     assert isinstance(value, DistributionalValue)
@@ -81,8 +81,9 @@ def predicted(model: MOMBA, observations: Array, seed: int = 0) -> tuple[Array, 
         inputs = policy.normalize(th.as_tensor(observations, device=model.device))
         logits = policy.critic(inputs, policy.actor(inputs))
     probabilities = logits.double().softmax(dim=-1).mean(dim=(0, 1))
-    atoms = (value.support.double() / policy.return_scale.factor).cpu().numpy()
-    return atoms + policy.left_out(observations[:1, policy.observation_dim :]).T, probabilities.cpu().numpy()
+    w = np.broadcast_to(observations[0, policy.observation_dim :], (value.n_outputs, policy.n_objectives))
+    atoms = value.support.double().cpu().numpy()[:, None].repeat(len(probabilities), axis=1)
+    return policy.in_reward_units(atoms, w).T, probabilities.cpu().numpy()
 
 
 def distributions(model: MOMBA, env: str, front: ParetoFront, seed: int = 0) -> list[list[Distribution]]:
