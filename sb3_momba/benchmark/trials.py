@@ -53,7 +53,7 @@ def cluster(address: str | None, processors: int, threads: int) -> Iterator[None
     elif address != "auto":
         _check_answers(address)
     with execution.on_sigterm(_interrupt):
-        with _environment(*ATTEMPTS) if address is not None else contextlib.nullcontext():
+        with _few_attempts() if address is not None else contextlib.nullcontext():
             _init(address, arguments, threads)
         try:
             with execution.on_sigterm(_interrupt):  # Ray has put its own handler in place.
@@ -83,13 +83,16 @@ def _init(address: str | None, arguments: Mapping[str, Any], threads: int) -> No
 
 
 @contextlib.contextmanager
-def _environment(name: str, value: str) -> Iterator[None]:
-    before = os.environ.get(name)
-    os.environ[name] = before or value
+def _few_attempts() -> Iterator[None]:
+    """Inside, Ray gives up a cluster that it cannot reach, unless the environment already says how long it may try."""
+    name, attempts = ATTEMPTS
+    is_ours = name not in os.environ
+    if is_ours:
+        os.environ[name] = attempts
     try:
         yield
     finally:
-        if before is None:
+        if is_ours:
             del os.environ[name]
 
 
