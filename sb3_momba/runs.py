@@ -192,7 +192,8 @@ def check(settings: RunSettings) -> None:
 def check_empty(folder: Path) -> None:
     """:raises ValueError: for a folder that holds anything, or something that is none"""
     if folder.exists() and (not folder.is_dir() or any(file.name != LOCK for file in folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output.")
+        way_on = f", or go on with its run: --resume {folder}" if checkpoints_in(folder / CHECKPOINTS) else ""
+        raise ValueError(f"{folder} exists and is not an empty folder: choose another --output{way_on}.")
 
 
 def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running: Any) -> RunResult:

@@ -6,6 +6,7 @@ in it.
 
 import argparse
 import json
+import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -30,6 +31,7 @@ from sb3_momba.zoo.configuration import (
 )
 
 ARCHITECTURES = {"simba": "SimbaPolicy", "mlp": "MlpPolicy", "xqc": "XqcPolicy", "flashsac": "FlashSacPolicy"}
+INTERRUPTED = (128 + signal.SIGINT, 128 + signal.SIGTERM)  # the exit codes of a training that a signal has ended
 
 
 def report(result: RunResult) -> str:
@@ -243,9 +245,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result = run(parse(arguments)) if given is None else resume(running.pop("resume"), **running)
     except (ValueError, MemoryError, ImportError, WorkerError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        print("\nInterrupted. If the training had begun, go on with --resume FOLDER.", file=sys.stderr)
-        sys.exit(130)
+    except (KeyboardInterrupt, SystemExit) as ending:
+        code = 128 + signal.SIGINT if isinstance(ending, KeyboardInterrupt) else ending.code
+        if code in INTERRUPTED:
+            print("\nInterrupted. If the training had begun, go on with --resume FOLDER.", file=sys.stderr)
+        sys.exit(code)
     print(report(result))
 
 

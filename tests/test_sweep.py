@@ -155,7 +155,7 @@ def test_what_a_training_raises_ends_it_and_the_others_go_on(tmp_path, capsys) -
     output = tmp_path / "sweep"
     arguments = ["sweep", "--conf", "momba", "--env", ENV, "tests.stubs:diverging-v0", "--seeds", "1", "--output", str(output)]
     arguments += [*TINY.format(steps=400).split(), "--workers", "2"]
-    with pytest.raises(SystemExit, match="error: 1 runs did not finish"):
+    with pytest.raises(SystemExit, match="error: 1 run did not finish"):
         main(arguments)
     failed = "momba/tests.stubs:diverging-v0/0"
     said = capsys.readouterr().err
@@ -166,7 +166,7 @@ def test_what_a_training_raises_ends_it_and_the_others_go_on(tmp_path, capsys) -
     assert record.traceback.startswith("Traceback (most recent call last):")
     assert ended(output / f"momba/{ENV}/0")
     # Once more: nothing runs, so that nothing needs Ray.
-    with pytest.raises(SystemExit, match="error: 1 runs did not finish"):
+    with pytest.raises(SystemExit, match="error: 1 run did not finish"):
         main([*arguments, "--address", "127.0.0.1:9"])
 
 

@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+from unittest.mock import Mock
 
 import mo_gymnasium
 import numpy as np
@@ -447,8 +448,20 @@ def test_a_bad_command_line_is_one_line_of_error(tmp_path, line: str, match: str
 
 def test_a_run_does_not_overwrite_another(tmp_path) -> None:
     (tmp_path / "something").touch()
-    with pytest.raises(SystemExit, match="not an empty folder: choose another"):
+    with pytest.raises(SystemExit, match=r"not an empty folder: choose another --output\.$"):
         main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path)])
+    (tmp_path / "checkpoints" / "0001-000010000").mkdir(parents=True)
+    with pytest.raises(SystemExit, match=f"or go on with its run: --resume {tmp_path}"):
+        main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path)])
+
+
+@pytest.mark.parametrize(("ending", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)], ids=["SIGINT", "SIGTERM"])
+def test_a_signal_says_how_to_go_on(ending: BaseException, code: int, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sb3_momba.train.run", Mock(side_effect=ending))
+    with pytest.raises(SystemExit) as raised:
+        main(["--env", "mo-hopper-2obj-v5"])
+    assert raised.value.code == code
+    assert "go on with --resume" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,9 @@ def end(failures: Mapping[str, str], output: Path, with_report: bool) -> None:
         except (ValueError, OSError) as error:
             errors.append(f"There is no report: {error}")
     if failures:
+        runs = "run" if len(failures) == 1 else "runs"
         errors.append(
-            f"{len(failures)} runs did not finish ({', '.join(failures)}); their logs lie beside their folders in {output}. "
+            f"{len(failures)} {runs} did not finish ({', '.join(failures)}); their logs lie beside their folders in {output}. "
             "The same command goes on with what was cut off or never began, and with --retry-failed with what failed."
         )
     if errors:

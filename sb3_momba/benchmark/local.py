@@ -19,8 +19,7 @@ from sb3_momba.benchmark import execution, grid
 from sb3_momba.benchmark.ending import end
 from sb3_momba.benchmark.grid import Cell
 from sb3_momba.files import FileFormatError, FolderInUseError
-
-INTERRUPTED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
+from sb3_momba.train import INTERRUPTED
 
 logger = logging.getLogger(__name__)
 
