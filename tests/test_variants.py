@@ -296,7 +296,12 @@ def test_shipped_configurations_build_models(name: str) -> None:
 def test_momba_plus_differs_between_tasks_in_what_stands_here_alone(env_id: str) -> None:
     own = {
         "MO-HalfCheetah-v4": {
-            *("gamma", "critic_loss", "vector_values", "reward_centering", "preference_sampler", "critic_hidden_dim"),
+            "gamma",
+            "critic_loss",
+            "vector_values",
+            "reward_centering",
+            "critic_hidden_dim",
+            "preference_sampler",
         },
         "MO-Hopper-v4": {"n_steps", "tau", "critic_hidden_dim"},
         "MO-Swimmer-v4": {"gamma", "n_steps", "tau", "noise_repeat"},
