@@ -11,7 +11,7 @@ import argparse
 import gymnasium as gym
 import numpy as np
 
-import sb3_momba.envs.pgmorl  # noqa: F401  registers its environments' ids
+import sb3_momba  # noqa: F401  registers its environments' ids
 
 IDS = {
     "MO-Hopper-v2": "MO-Hopper-v4",

@@ -27,7 +27,7 @@ from sb3_momba.baselines.schedules import OF_OTHERS, SCRIPTS, Script, default_st
 from sb3_momba.baselines.settings import ALGORITHMS, BaselineSettings
 from sb3_momba.baselines.utilities import linear_utilities
 from sb3_momba.benchmark.__main__ import main as benchmark
-from sb3_momba.envs.pgmorl import TASKS
+from sb3_momba.envs.registry import TASKS
 from sb3_momba.records import Record, read_record
 from tests.stubs import TINY_SIMBA
 

@@ -19,7 +19,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_momba import MOMBA, ParetoFront, evaluate_front
-from sb3_momba.envs.pgmorl import TASKS
+from sb3_momba.envs.registry import TASKS
 from sb3_momba.explorer import charts, report
 from sb3_momba.explorer.__main__ import main
 from sb3_momba.explorer.reading import read_run, read_runs

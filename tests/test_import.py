@@ -45,12 +45,16 @@ def test_the_core_needs_no_extra() -> None:
     modules = json.loads(subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True).stdout)
     assert "sb3_momba" in modules
     extras = {"rl_zoo3", "optuna", "wandb", "onnx", "huggingface_hub", "pymoo", "morl_baselines", "plotly", "imageio_ffmpeg"}
-    assert not {"matplotlib", *extras} & set(modules)
+    assert not {"matplotlib", "mujoco", *extras} & set(modules)
 
 
 def test_the_core_is_imported_in_three_seconds() -> None:
-    """Of processor time."""
+    """Of processor time, the least of three: what else runs only adds to it."""
+    assert min(seconds_to_import("sb3_momba") for _ in range(3)) < 3
+
+
+def seconds_to_import(module: str) -> float:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", "import sb3_momba"], check=True)
+    subprocess.run([sys.executable, "-c", f"import {module}"], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime < 3
+    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime

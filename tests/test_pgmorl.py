@@ -15,8 +15,8 @@ from stable_baselines3.common import env_checker as sb3_env_checker
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_momba.envs.making import make_mo_vec_env
-from sb3_momba.envs.pgmorl import TASKS, register
 from sb3_momba.envs.pgmorl_physics import sums_margins
+from sb3_momba.envs.registry import TASKS
 from sb3_momba.envs.wrappers import PreferenceWrapper
 
 IDS = sorted(TASKS)
@@ -364,14 +364,6 @@ def test_sb3_checker(task):
         sb3_env_checker.check_env(env, skip_render_check=True)
 
 
-def test_registering_again_changes_nothing():
-    before = {task: gym.spec(task) for task in IDS}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        register()
-    assert {task: gym.spec(task) for task in IDS} == before
-
-
 @EVERY_TASK
 def test_info_and_reset_options(task):
     env = gym.make(task)
@@ -395,7 +387,7 @@ def test_errors():
 
 RENDER = """
 import gymnasium, numpy
-import sb3_momba.envs.pgmorl
+import sb3_momba
 for mode, shape in (("rgb_array", (120, 160, 3)), ("depth_array", (120, 160))):
     env = gymnasium.make("MO-Walker2d-v4", render_mode=mode, width=160, height=120)
     env.reset(seed=0)

@@ -13,8 +13,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_momba import MOMBA, ParetoEvalCallback, PreferenceWrapper, evaluate_front, make_mo_vec_env
 from sb3_momba.envs.making import make_env
-from sb3_momba.envs.pgmorl import TASKS
-from sb3_momba.envs.registry import CONTINUOUS, NEEDED_ARGUMENTS, copies_of, preference_id, raw_id
+from sb3_momba.envs.registry import CONTINUOUS, NEEDED_ARGUMENTS, TASKS, copies_of, preference_id, raw_id
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
 from sb3_momba.records import Record
 from tests.stubs import TINY_SIMBA, StubEnv

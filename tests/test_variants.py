@@ -13,8 +13,8 @@ import yaml
 from mo_gymnasium.wrappers.wrappers import LinearReward
 
 from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, PreferenceWrapper
-from sb3_momba.envs.pgmorl import TASKS
 from sb3_momba.envs.preferences import ConeSampler, FixedSampler, GainSampler, PerStepSampler, UniformSampler, make_sampler
+from sb3_momba.envs.registry import TASKS
 from sb3_momba.nn.layers import Film, HyperDense
 from sb3_momba.nn.networks import CONDITIONINGS
 from sb3_momba.train import main, parse

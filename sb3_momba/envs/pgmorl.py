@@ -1,7 +1,7 @@
 """The seven continuous-control tasks of Table 4.1, from PGMORL (Xu et al., 2020, Prediction-Guided Multi-Objective
 Reinforcement Learning for Continuous Robot Control).
 
-`gymnasium.make("MO-Hopper-v4", physics="2020")`, once this module is imported. The models are those that Gymnasium ships,
+`gymnasium.make("MO-Hopper-v4", physics="2020")`, once sb3_momba is imported. The models are those that Gymnasium ships,
 edited as each class says. `physics="2020"`, the default, undoes what changed since the published fronts were made, on every
 MuJoCo release from 3.2 on; `physics="current"` takes the model as the installed MuJoCo compiles it. Releases still differ in
 their solvers and, since 4.0, in how RK4 turns the free bodies of Ant and Humanoid, by 1e-11 to 1e-7 per step.
@@ -9,8 +9,6 @@ their solvers and, since 4.0, in how RK4 turns the free bodies of Ant and Humano
 
 import os
 from typing import Any, ClassVar
-
-import gymnasium as gym
 
 try:
     import mujoco  # type: ignore[import-untyped]
@@ -336,30 +334,3 @@ class MOWalker2d(PgmorlEnv):
 
     def _rewards(self, velocity: np.ndarray, energy: float) -> tuple[float, ...]:
         return velocity[0] + 1, 4 - energy + 1
-
-
-TASKS: dict[str, tuple[type[PgmorlEnv], int]] = {
-    "MO-Ant-v4": (MOAnt, 500),
-    "MO-HalfCheetah-v4": (MOHalfCheetah, 500),
-    "MO-Hopper-v4": (MOHopper, 500),
-    "MO-Hopper-3obj-v4": (MOHopper3, 500),
-    "MO-Humanoid-v4": (MOHumanoid, 1000),
-    "MO-Swimmer-v4": (MOSwimmer, 500),
-    "MO-Walker2d-v4": (MOWalker2d, 500),
-}
-"""The registered ids: class, and steps after which an episode is truncated."""
-
-
-def register() -> None:
-    """Register the ids with Gymnasium, once: ids that are there already stay as they are."""
-    for task, (env_class, max_episode_steps) in TASKS.items():
-        if task not in gym.registry:
-            gym.register(
-                task,
-                entry_point=f"{__name__}:{env_class.__name__}",
-                max_episode_steps=max_episode_steps,
-                disable_env_checker=True,  # It does not know vector rewards.
-            )
-
-
-register()

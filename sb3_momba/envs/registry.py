@@ -13,10 +13,19 @@ import mo_gymnasium  # noqa: F401  registers its environments' ids
 from gymnasium.envs.registration import WrapperSpec
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_momba.envs.pgmorl import TASKS
-
 PREFIX = "momba/"
 WRAPPER = WrapperSpec("PreferenceWrapper", "sb3_momba.envs.wrappers:PreferenceWrapper", {"preference_sampler": None})
+
+TASKS = {
+    "MO-Ant-v4": ("MOAnt", 500),
+    "MO-HalfCheetah-v4": ("MOHalfCheetah", 500),
+    "MO-Hopper-v4": ("MOHopper", 500),
+    "MO-Hopper-3obj-v4": ("MOHopper3", 500),
+    "MO-Humanoid-v4": ("MOHumanoid", 1000),
+    "MO-Swimmer-v4": ("MOSwimmer", 500),
+    "MO-Walker2d-v4": ("MOWalker2d", 500),
+}
+"""The seven tasks of Table 4.1: the class in `sb3_momba.envs.pgmorl`, and steps after which an episode is truncated."""
 
 # MO-Gymnasium's tasks with one-dimensional observations and continuous actions.
 CONTINUOUS = (
@@ -83,5 +92,12 @@ def copies_of(venv: VecEnv) -> Callable[[], gym.Env]:
     return partial(gym.make, spec, disable_env_checker=True)
 
 
+for _task, (_class, _steps) in TASKS.items():
+    gym.register(
+        _task,
+        entry_point=f"sb3_momba.envs.pgmorl:{_class}",
+        max_episode_steps=_steps,
+        disable_env_checker=True,  # It does not know vector rewards.
+    )
 for _task in (*CONTINUOUS, *TASKS):
     preference_id(_task)
