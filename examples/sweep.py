@@ -20,7 +20,7 @@ from sb3_momba.benchmark.sweep import run_sweep
 
 def main(steps: int = 2_000, folder: Path = Path("runs/sweep")) -> None:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
-    options = ["--steps", str(steps), "--eval-freq", str(steps // 4), "--n-preferences", "20", "--n-episodes", "1"]
+    options = ["--steps", str(steps), "--eval-freq", str(steps // 2), "--n-preferences", "20", "--n-episodes", "1"]
     options += ["--set", "learning_starts=500"]
     cells = make_cells(["momba", "her"], ["MO-HalfCheetah-v4", "MO-Hopper-v4"], seeds=2, options=options, auto_ent_coef=0.01)
     for name, error in run_sweep(cells, folder).items():
