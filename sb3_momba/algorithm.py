@@ -109,6 +109,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             "return_scaling": self.return_scaling,
             "reward_centering": self.reward_centering,
             "gamma": self.gamma,
+            "deterministic_policy": self.td3_noise is not None,
         }
 
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:

@@ -34,13 +34,14 @@ class MombaPolicy(BasePolicy):
     :param lr_schedule: learning rate as a function of the remaining progress, 1 at the start
     :param actor_architecture: builds the actor's layers
     :param critic_architecture: builds the layers of each critic
-    :param n_objectives: injected by MOMBA, like the next six; see there
+    :param n_objectives: injected by MOMBA, like the next seven; see there
     :param critic_loss: "ce" or "mse"
     :param vector_values: critics of the vector return
     :param best_return_scale: what the largest return seen is scaled to
     :param return_scaling: "maximum" or "deviation"
     :param reward_centering: whether critics learn by how much returns exceed what the mean reward is worth
     :param gamma: discount of the returns that are scaled, and of what the mean reward is worth
+    :param deterministic_policy: the policy is its mean action (TD3), whether asked for a sample or not
     :param n_critics: size of the ensemble
     :param n_atoms: atoms of a return distribution (critic_loss="ce")
     :param support: first and last atom, in scaled returns
@@ -70,6 +71,7 @@ class MombaPolicy(BasePolicy):
         return_scaling: str = "maximum",
         reward_centering: bool = False,
         gamma: float = 0.99,
+        deterministic_policy: bool = False,
         n_critics: int = 2,
         n_atoms: int = 101,
         support: tuple[float, float] = (-5.0, 5.0),
@@ -90,6 +92,7 @@ class MombaPolicy(BasePolicy):
         self.preference_dim = preference_dim(n_objectives)
         self.observation_dim = int(observation_space.shape[0]) - self.preference_dim
         self.vector_values = vector_values
+        self.deterministic_policy = deterministic_policy
         self.normalize_observations = normalize_observations
         self.normalize_weights = normalize_weights
 
@@ -282,4 +285,4 @@ class MombaPolicy(BasePolicy):
         return self._predict(observation, deterministic)
 
     def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:  # type: ignore[override]
-        return self.actor(self.normalize(observation), deterministic)
+        return self.actor(self.normalize(observation), deterministic or self.deterministic_policy)

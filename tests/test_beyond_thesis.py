@@ -191,6 +191,17 @@ def test_td3_explores_under_noise_around_the_mean_action():
     np.testing.assert_allclose(deviations.std(axis=0), 0.1, rtol=0.09)
 
 
+@pytest.mark.parametrize("policy", MOMBA.policy_aliases)
+def test_td3_predicts_its_mean_action_whether_asked_for_a_sample_or_not(policy, tmp_path):
+    model = tiny_model(StubEnv(), policy=policy, td3_noise=0.1, ent_coef=0.0)
+    observation = StubEnv().observation_space.sample()
+    model.policy.save(tmp_path / "policy")
+    for one in (model.policy, type(model.policy).load(tmp_path / "policy", "cpu")):
+        actions = [one.predict(np.append(observation, [0.5, 0.5]), deterministic=flag)[0] for flag in (False, False, True)]
+        assert np.array_equal(*actions[:2])
+        assert np.array_equal(*actions[1:])
+
+
 def test_td3_targets_are_smoothed_by_twice_the_noise_and_clipped_at_five_times():
     th.manual_seed(0)
     noise = td3_smoothed(th.full((100_000, 1), 0.1), 0.1) - 0.1
