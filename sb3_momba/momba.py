@@ -232,7 +232,8 @@ class MOMBA(PreferenceConditionedAlgorithm):
     def _gradient_step(self, batch: PreferenceReplayBufferSamples) -> None:
         """One pass through the inner loop of Algorithm 1."""
         if self.reset_interval is not None and self._n_updates > 0 and self._n_updates % self.reset_interval == 0:
-            self.policy.reset_networks()
+            if self._skipped_updates == 0:  # What is tried again has had its reset.
+                self.policy.reset_networks()
         alpha = self.alpha
         with self._rounded_products():
             critic_loss, metrics = self._critic_loss(batch, alpha)

@@ -172,6 +172,19 @@ def test_a_reset_comes_before_each_update_whose_number_the_interval_divides(monk
     assert resets == [3, 6]
 
 
+def test_an_update_that_is_tried_again_has_had_its_reset(monkeypatch):
+    model, resets = trained(reset_interval=3), []
+    monkeypatch.setattr(model.policy, "reset_networks", lambda: resets.append(model._n_updates))
+    model.train(3, 8)
+    actor_loss = model._actor_loss
+    monkeypatch.setattr(model, "_actor_loss", lambda *given: (actor_loss(*given)[0] * th.nan, None, {}))
+    model.train(2, 8)
+    monkeypatch.setattr(model, "_actor_loss", actor_loss)
+    model.train(1, 8)
+    assert model._n_updates == 4
+    assert resets == [3]
+
+
 @pytest.mark.parametrize("wrong", [0, 1.5, True], ids=str)
 def test_a_wrong_interval_is_named(wrong):
     with pytest.raises(ValueError, match=f"reset_interval={wrong}.*whole number"):
