@@ -263,7 +263,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         observations = self._last_obs[:, : self.policy.observation_dim]
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
-        self.policy.observe_rewards(self.replay_buffer.latest_rewards, self.replay_buffer.latest_terminations, dones)
+        self.policy.observe_rewards(self.replay_buffer.latest_rewards, dones)
         if self.preference_alignment and self.preference_alignment != "positive":
             self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
 
@@ -328,7 +328,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         """Write the log, with the means of the training metrics since the last time."""
         if self._metrics.sums:
             self._metrics.record(self.logger)
-            self.logger.record("train/return_scale", self.policy.return_scale.factor)
+            self.logger.record("train/return_scale", self.policy.reward_factor)
             self.logger.record("train/actor_weight_norm", weight_norm(self.actor))
             self.logger.record("train/critic_weight_norm", weight_norm(self.critic))
             self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -191,11 +191,6 @@ class PreferenceReplayBuffer(ReplayBuffer):
         """Of the step stored last, (n_envs, n_objectives)."""
         return self.rewards[self.pos - 1]
 
-    @property
-    def latest_terminations(self) -> np.ndarray:
-        """Whether the step stored last ended an episode, and no time limit did, (n_envs,): 0 or 1."""
-        return self._terminations(self.pos - 1)
-
     def _terminations(self, *index: Any) -> np.ndarray:
         return self.dones[index] * (1 - self.timeouts[index])
 

@@ -280,7 +280,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         return batch._replace(
             observations=self.policy.normalize(batch.observations),
             next_observations=self.policy.normalize(batch.next_observations),
-            rewards=rewards * self.policy.return_scale.factor,
+            rewards=rewards * self.policy.reward_factor,
         )
 
     def _critic_loss(self, batch: PreferenceReplayBufferSamples, alpha: th.Tensor) -> tuple[th.Tensor, Metrics]:

@@ -141,21 +141,22 @@ class MombaPolicy(BasePolicy):
         """What critics learn from, (batch, n_objectives), not scaled yet: see RewardCenter."""
         return rewards if self.reward_center is None else self.reward_center(rewards, discounts)
 
-    def observe_rewards(self, rewards: np.ndarray, terminated: np.ndarray, dones: np.ndarray) -> None:
+    def observe_rewards(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """Update the statistics of rewards and their returns with one step.
 
         :param rewards: (n_envs, n_objectives)
-        :param terminated: where it ended an episode, but no time limit did, (n_envs,)
         :param dones: where it ended an episode, (n_envs,)
         """
         if self.reward_center is not None:
-            self.reward_center.update(rewards, terminated)
-            # In float64: rounding must not become the largest return.
-            rewards64, ended = (th.as_tensor(x, dtype=th.float64, device=self.device) for x in (rewards, terminated))
-            rewards = self.reward_center(rewards64, self.reward_center.gamma * (1 - ended)).cpu().numpy()
-            if self.reward_center.has_terminated:  # What follows an end is worth today's -V, in old transitions too.
-                self.return_scale.raise_to(float(self.reward_center.value.abs().max()))
+            self.reward_center.statistics.update(rewards)
+            rewards = rewards - self.reward_center.statistics.mean.cpu().numpy()
         self.return_scale.update(rewards, dones)
+
+    @property
+    def reward_factor(self) -> float:
+        """What a reward is multiplied by before critics learn from it. With centring, what follows an end is worth -V."""
+        lacking = 0.0 if self.reward_center is None else float(self.reward_center.value.abs().max())
+        return self.return_scale.factor(lacking)
 
     def in_reward_units(self, values: np.ndarray, preferences: np.ndarray) -> np.ndarray:
         """Values as critics have them in the units of the rewards: no longer scaled, nor lacking the V of RewardCenter.
@@ -164,7 +165,7 @@ class MombaPolicy(BasePolicy):
         :param preferences: w, (n, n_objectives)
         :return: of the shape of the values
         """
-        values = values / self.return_scale.factor
+        values = values / self.reward_factor
         if self.reward_center is None:
             return values
         lacking = self.reward_center.value.cpu().numpy()

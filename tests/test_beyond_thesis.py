@@ -1,4 +1,4 @@
-"""What MOMBA can do beyond the thesis, one argument each: hand-computed numbers first, then that the default is untouched."""
+"""What MOMBA can do beyond the thesis, one argument each: hand-computed numbers first, then what they refuse."""
 
 import math
 
@@ -404,25 +404,25 @@ def test_rewards_are_divided_by_the_largest_deviation_or_by_what_keeps_the_maxim
     """gamma = 0.5. Rewards (4, 1), (0, 1), (0, 1): G is (4, 1), (2, 1.5), (1, 1.75). Its first part has the variance 14/9
     and the maximum 4."""
     scale = DeviationScale(5.0, 0.5, 2)
-    assert scale.factor == 1
+    assert scale.factor() == 1
     for reward in ([4.0, 1.0], [0.0, 1.0], [0.0, 1.0]):
         scale.update(np.array([reward]), np.array([False]))
     assert 4 / 5 < (14 / 9) ** 0.5
-    assert scale.factor == pytest.approx((9 / 14) ** 0.5)
+    assert scale.factor() == pytest.approx((9 / 14) ** 0.5)
     tight = DeviationScale(2.0, 0.5, 2)
     for reward in ([4.0, 1.0], [0.0, 1.0], [0.0, 1.0]):
         tight.update(np.array([reward]), np.array([False]))
-    assert tight.factor == pytest.approx(2 / 4)
+    assert tight.factor() == pytest.approx(2 / 4)
     two_environments = DeviationScale(5.0, 0.5, 1)
     two_environments.update(np.array([[1.0], [3.0]]), np.array([False, False]))
-    assert two_environments.factor == pytest.approx(1 / 1)
+    assert two_environments.factor() == pytest.approx(1 / 1)
 
 
 def test_returns_that_are_all_equal_have_no_deviation_to_divide_by():
     scale = DeviationScale(5.0, 0.0, 1)
     for _ in range(3):
         scale.update(np.array([[2.0], [2.0]]), np.array([False, False]))
-    assert scale.factor == pytest.approx(5 / 2)
+    assert scale.factor() == pytest.approx(5 / 2)
 
 
 def test_the_deviation_scales_a_training_and_is_saved(tmp_path):
@@ -431,7 +431,7 @@ def test_the_deviation_scales_a_training_and_is_saved(tmp_path):
     assert isinstance(scale, DeviationScale)
     assert float(scale.statistics.count) == 60
     model.save(tmp_path / "model")
-    assert MOMBA.load(tmp_path / "model").policy.return_scale.factor == scale.factor != 1
+    assert MOMBA.load(tmp_path / "model").policy.reward_factor == scale.factor() != 1
     with pytest.raises(ValueError, match="return_scaling='deviation' with best_return_scale=None"):
         tiny_model(StubEnv(), return_scaling="deviation", best_return_scale=None)
     with pytest.raises(ValueError, match="return_scaling='mean' is not known"):
@@ -460,24 +460,41 @@ def test_what_critics_learn_is_less_by_what_the_mean_reward_is_worth():
     th.testing.assert_close(without - center.value, with_it, check_dtype=False)
 
 
-def test_the_end_of_an_episode_counts_for_the_scale_of_centred_returns():
-    """Rewards (2, 0), then (4, 2), whose means are (2, 0) and (3, 1), worth (4, 0) and (6, 2). Behind a time limit G is (0, 0)
-    and (4 - 3, 2 - 1); what follows a true end is worth -(6, 2), and later minus what the mean is worth then."""
-    for terminated, largest in ((0.0, 1.0), (1.0, 6.0)):
-        policy = tiny_model(StubEnv(), reward_centering=True, gamma=0.5).policy
-        policy.observe_rewards(np.array([[2.0, 0.0]]), np.array([0.0]), np.array([False]))
-        assert policy.return_scale.factor == 1
-        policy.observe_rewards(np.array([[4.0, 2.0]]), np.array([terminated]), np.array([True]))
-        assert policy.return_scale.factor == pytest.approx(3 / largest)
-    policy.observe_rewards(np.array([[9.0, 1.0]]), np.array([0.0]), np.array([False]))  # The mean is (5, 1).
-    assert policy.return_scale.factor == pytest.approx(3 / 10)
+def test_the_scale_of_centred_returns_knows_what_an_end_is_worth_before_one_comes():
+    """Rewards (2, 0), (4, 2) and (-18, -2), whose means (2, 0), (3, 1) and (-4, 0) are worth (4, 0), (6, 2) and (-8, 0) with
+    gamma = 0.5. Less the mean they are (0, 0), (1, 1) and (-14, -2): G is the same, after an end between the last two."""
+    policy = tiny_model(StubEnv(), reward_centering=True, gamma=0.5).policy
+    for reward, done, largest in (([2.0, 0.0], False, 4), ([4.0, 2.0], True, 6), ([-18.0, -2.0], False, 14)):
+        policy.observe_rewards(np.array([reward]), np.array([done]))
+        assert policy.reward_factor == pytest.approx(3 / largest)
+
+
+def test_what_the_first_mean_was_worth_is_not_kept():
+    """One bad step, then good ones: the mean -100 is worth -200, later 1 - 101/400 is worth 1.5."""
+    policy = tiny_model(StubEnv(n_objectives=1), reward_centering=True, gamma=0.5).policy
+    policy.observe_rewards(np.array([[-100.0]]), np.array([True]))
+    assert policy.reward_factor == pytest.approx(3 / 200)
+    for _ in range(399):
+        policy.observe_rewards(np.array([[1.0]]), np.array([False]))
+    assert policy.reward_center.value.item() == pytest.approx(2 * (1 - 101 / 400))
+    assert policy.reward_factor == pytest.approx(3 / float(policy.return_scale.max_return))
+    assert float(policy.return_scale.max_return) < 100
+
+
+def test_a_late_first_fall_does_not_move_the_scale():
+    policy = tiny_model(StubEnv(n_objectives=1), reward_centering=True, gamma=0.95).policy
+    for step in range(2_000):
+        policy.observe_rewards(np.array([[4.0 + (step % 2)]]), np.array([step % 500 == 499]))
+    before = policy.reward_factor
+    policy.observe_rewards(np.array([[4.0]]), np.array([True]))
+    assert policy.reward_factor == pytest.approx(before, rel=1e-3)
 
 
 def test_equal_rewards_leave_no_rounding_to_be_scaled_up():
     policy = tiny_model(StubEnv(n_objectives=1), reward_centering=True).policy
     for _ in range(300):
-        policy.observe_rewards(np.full((2, 1), -0.1, dtype=np.float32), np.zeros(2, dtype=np.float32), np.zeros(2, dtype=bool))
-    assert policy.return_scale.factor == 1
+        policy.observe_rewards(np.full((2, 1), -0.1, dtype=np.float32), np.zeros(2, dtype=bool))
+    assert policy.reward_factor == pytest.approx(3 / 10)
 
 
 @pytest.mark.parametrize(("ending", "n_steps"), [("terminated", 1), ("terminated", 3), ("truncated", 1), ("truncated", 3)])
@@ -505,7 +522,6 @@ def test_the_center_is_saved(tmp_path):
     model.save(tmp_path / "model")
     loaded = MOMBA.load(tmp_path / "model").policy
     assert float(loaded.reward_center.statistics.count) == 60
-    assert loaded.reward_center.has_terminated
     assert th.equal(loaded.reward_center.value, model.policy.reward_center.value)
 
 

@@ -669,17 +669,17 @@ def test_return_scale_by_hand() -> None:
         ([[0, 0], [10, 0]], [0, 0], 11.5),  # the other environment goes on: 2, 3, 11.5
         ([[0, 0], [0, 0]], [0, 0], 11.5),
     ]
-    assert scale.factor == 1
+    assert scale.factor() == 1
     for rewards, dones, largest in steps:
         scale.update(np.array(rewards), np.array(dones))
-        assert scale.factor == pytest.approx(3 / largest)
+        assert scale.factor() == pytest.approx(3 / largest)
 
 
 @pytest.mark.parametrize(("reward", "factor"), [(0.0, 1.0), (9e-9, 1.0), (1e-7, 3e7)])
 def test_return_scale_is_1_while_returns_are_below_1e_8(reward: float, factor: float) -> None:
     scale = ReturnScale(best_return_scale=3.0, gamma=0.5)
     scale.update(np.array([[reward, -reward]]), np.array([1]))
-    assert scale.factor == pytest.approx(factor)
+    assert scale.factor() == pytest.approx(factor)
 
 
 @pytest.mark.parametrize(("best_return_scale", "factor"), [(3.0, 3 / 20), (None, 1.0)])
@@ -698,7 +698,7 @@ def test_a_new_call_of_learn_starts_a_new_return() -> None:
     model = make_model(CountingEnv(length=100), gamma=0.5, best_return_scale=3.0)
     model.learn(2)
     model.learn(2)
-    assert model.policy.return_scale.factor == pytest.approx(3 / 16)
+    assert model.policy.reward_factor == pytest.approx(3 / 16)
 
 
 # ------------------------------------------------------------------------------------------------------ replay buffer

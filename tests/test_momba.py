@@ -190,13 +190,13 @@ def test_a_policy_can_be_given_as_a_class():
 
 def test_switches_do_what_they_say():
     off = tiny_model(StubEnv(), best_return_scale=None, policy_kwargs={"normalize_observations": False}).learn(25)
-    assert off.policy.return_scale.factor == 1
+    assert off.policy.reward_factor == 1
     observations = th.rand(4, 5)
     assert off.policy.normalize(observations) is observations
     on = tiny_model(StubEnv(), best_return_scale=6.0).learn(25)
     # With gamma = 0.99 and [t, -10 t], the largest return is that of the second objective over the second episode.
     largest = sum(0.99 ** (20 - t) * 10 * t for t in range(11, 21))
-    assert on.policy.return_scale.factor == pytest.approx(6.0 / largest)
+    assert on.policy.reward_factor == pytest.approx(6.0 / largest)
     np.testing.assert_array_equal(on.policy.normalize(observations)[:, 3:], observations[:, 3:])
     weights = [module.weight for module in on.actor.modules() if type(module).__name__ == "HyperDense"]
     assert len(weights) > 4
@@ -398,7 +398,7 @@ def test_what_is_logged(policy, n_objectives, vector_values, values):
     assert last["train/n_updates"] == 39
     assert last["time/total_timesteps"] == 60
     assert 0 <= last["train/target_end_mass"] <= 1
-    assert last["train/return_scale"] == pytest.approx(model.policy.return_scale.factor, rel=1e-6)
+    assert last["train/return_scale"] == pytest.approx(model.policy.reward_factor, rel=1e-6)
     if policy == "SimbaPolicy":
         assert last["train/feature_norm"] == pytest.approx(1, rel=1e-4)
     norm = th.cat([parameter.flatten() for parameter in model.critic.parameters()]).detach().norm()

@@ -440,7 +440,7 @@ def test_a_loaded_model_has_the_same_parameters_optimisers_statistics_and_predic
     again = MOMBA.load(tmp_path / "model")
     assert_same_tree(again.get_parameters(), model.get_parameters())
     assert len(again.critic.optimizer.state) == len(list(again.critic.parameters()))
-    assert again.policy.return_scale.factor == model.policy.return_scale.factor != 1
+    assert again.policy.reward_factor == model.policy.reward_factor != 1
     assert again.alpha == model.alpha
     np.testing.assert_array_equal(actions_of(again), actions_of(model))
     for name in (

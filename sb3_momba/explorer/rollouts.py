@@ -96,7 +96,7 @@ def critic_excess(model: MOMBA, observations: Array32, preference: Array32, is_t
     is_counted[last] = is_truncated
     bonuses = -float(model.alpha) * log_prob.double().numpy() * model.gamma**steps
     behind = is_truncated * model.gamma**last * critic_values(model, observations[last:], preference[None])[0]
-    return np.asarray(bonuses[is_counted].sum() / model.policy.return_scale.factor + behind)
+    return np.asarray(bonuses[is_counted].sum() / model.policy.reward_factor + behind)
 
 
 @th.no_grad()

@@ -57,27 +57,16 @@ class RewardCenter(nn.Module):
     the mean reward r of all steps so far is worth for ever.
 
     Its best actions are those of Q, as V is the same everywhere; what follows the end of an episode is worth -V. What all
-    values have in common need not be learned. Where no episode ends but by a time limit, what is left is also scaled up.
+    values have in common need not be learned.
 
     :param n_objectives: width of the rewards
     :param gamma: discount, below 1
     """
 
-    has_terminated: th.Tensor
-
     def __init__(self, n_objectives: int, gamma: float):
         super().__init__()
         self.gamma = gamma
         self.statistics = RunningStatistics(n_objectives)
-        self.register_buffer("has_terminated", th.zeros((), dtype=th.bool))
-
-    def update(self, rewards: np.ndarray, terminated: np.ndarray) -> None:
-        """
-        :param rewards: (n_envs, n_objectives)
-        :param terminated: where an episode has just ended, but by no time limit, (n_envs,)
-        """
-        self.statistics.update(rewards)
-        self.has_terminated |= bool(terminated.any())
 
     @property
     def value(self) -> th.Tensor:
@@ -127,11 +116,7 @@ class ReturnScale(nn.Module):
 
     def observe(self, returns: np.ndarray) -> None:
         """:param returns: G of every environment at this step, (n_envs, n_objectives)"""
-        self.raise_to(float(np.abs(returns).max()))
-
-    def raise_to(self, largest: float) -> None:
-        """The largest return is at least that."""
-        self.max_return.fill_(max(float(self.max_return), largest))
+        self.max_return.fill_(max(float(self.max_return), float(np.abs(returns).max())))
 
     def end_episodes(self, indices: Sequence[int] | None = None) -> None:
         """The next rewards begin new returns, in any number of environments.
@@ -143,10 +128,12 @@ class ReturnScale(nn.Module):
         elif self.running_returns is not None:
             self.running_returns[list(indices)] = 0.0
 
-    @property
-    def factor(self) -> float:
-        """What a reward is multiplied by; 1 while no return is above 1e-8."""
-        largest = float(self.max_return)
+    def factor(self, value: float = 0.0) -> float:
+        """What a reward is multiplied by; 1 while no return is above 1e-8.
+
+        :param value: of this size are values that critics learn besides returns
+        """
+        largest = max(float(self.max_return), value)
         if self.best_return_scale is None or largest < SMALLEST_RETURN:
             return 1.0
         return self.best_return_scale / largest
@@ -167,10 +154,6 @@ class DeviationScale(ReturnScale):
         super().observe(returns)
         self.statistics.update(returns)
 
-    @property
-    def factor(self) -> float:
-        """What a reward is multiplied by; 1 while no return is above 1e-8."""
-        if float(self.max_return) < SMALLEST_RETURN:
-            return 1.0
-        assert self.best_return_scale is not None
-        return 1 / max(float(self.max_return) / self.best_return_scale, float(self.statistics.variance.max().sqrt()))
+    def factor(self, value: float = 0.0) -> float:
+        deviation = float(self.statistics.variance.max().sqrt())
+        return min(super().factor(value), 1 / max(deviation, SMALLEST_RETURN))
