@@ -215,14 +215,25 @@ def test_a_sampler_with_a_memory_is_told_of_the_latest_episodes() -> None:
     earned = []
     for _ in range(4):
         env.reset()
-        vector_return, over = np.zeros(2), False
-        while not over:
-            _, _, terminated, truncated, info = env.step(env.action_space.sample())
-            vector_return, over = vector_return + info["vector_reward"], terminated or truncated
-        earned.append(vector_return)
+        earned.append(play(env))
     assert [len(preferences) for preferences, _ in told] == [0, 1, 2, 2]
     np.testing.assert_allclose(told[-1][0], [[0.2, 0.8], [0.3, 0.7]], rtol=1e-6)
     np.testing.assert_allclose(told[-1][1], earned[1:3], rtol=1e-6)
+    env.reset(seed=0)  # Everything from here on follows from the seed.
+    assert len(told[-1][0]) == 0
+    play(env)
+    env.set_preference_sampler(Asked())  # of another training
+    env.reset()
+    assert len(told[-1][0]) == 0
+
+
+def play(env: PreferenceWrapper) -> np.ndarray:
+    """What the rest of an episode earns, (n_objectives,)."""
+    vector_return, over = np.zeros(2), False
+    while not over:
+        _, _, terminated, truncated, info = env.step(env.action_space.sample())
+        vector_return, over = vector_return + info["vector_reward"], terminated or truncated
+    return vector_return
 
 
 def test_samplers_from_literals() -> None:

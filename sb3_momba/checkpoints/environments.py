@@ -65,6 +65,8 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
     env._reset_seeds()
     env._reset_options()
     if isinstance(env, VecEnvWrapper):
+        for index, state in enumerate(states or []):
+            env.env_method("begin_replay", state, indices=[index])
         _warn(list(range(env.num_envs)), f"{type(env).__name__} around them has a state of its own.")
         return np.asarray(env.reset()), list(range(env.num_envs))
     observations, lost = observations.copy(), []

@@ -86,14 +86,14 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         self._holds_for_episode = self._holds_for_episode and preference is None
 
     def set_preference_sampler(self, sampler: PreferenceSampler | SamplerSpec | CloudpickleWrapper | None) -> None:
-        """Draw preferences with `sampler` from the next draw on; None: uniform on the simplex.
+        """Draw preferences with `sampler` from the next draw on; None: uniform on the simplex. It remembers no episode yet.
 
         :param sampler: or SB3's wrapper around it, which takes any callable into subprocesses
         """
         own = sampler.var if isinstance(sampler, CloudpickleWrapper) else sampler
         self.preference_sampler: PreferenceSampler = make_sampler("uniform" if own is None else own, self.n_objectives)
         self._n_remembered = int(getattr(self.preference_sampler, "remembered_episodes", 0))
-        self._played = self._played[max(0, len(self._played) - self._n_remembered) :]
+        self._played = self._played[:0]
 
     def set_env_index(self, index: int) -> None:
         """The environment's place in its VecEnv, for error messages."""
@@ -102,7 +102,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode.
 
-        :param seed: of the environment, and of the sampler's own random stream
+        :param seed: of the environment, and of the sampler's own random stream; episodes before it are forgotten
         :param options: `preference`, (n_objectives,), holds for this episode; all others go to the environment
         :return: [observation, w], float32 (observation_dim + preference_dim,), and the environment's info
         :raises ValueError: for a preference off the simplex, or an observation that is not finite or not of its space's shape
@@ -114,6 +114,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         if seed is not None:
             # A stream of its own: the environment draws from default_rng(seed) itself.
             self._rng = np.random.default_rng([seed, 1])
+            self._played = self._played[:0]
         self._episode = {
             "seed": seed,
             "options": options or None,
