@@ -107,6 +107,8 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
             "one of them out."
         )
     hyperparameters = configuration.hyperparameters
+    if given.preference is not None:
+        hyperparameters.pop("preference_sampler", None)
     options = {
         "critic_loss": given.critic_loss,
         "vector_values": given.vector_values or None,

@@ -6,6 +6,7 @@ import yaml
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_momba.envs.registry import preference_id
+from sb3_momba.runs import hyperparameters_of
 from sb3_momba.train import parse
 from sb3_momba.zoo.configuration import check_entry, find_entry, literal, read_configuration, with_schedules
 from tests.stubs import StubEnv
@@ -27,6 +28,16 @@ def test_the_environments_arguments_come_from_the_file_and_the_command_line(tmp_
         "physics": "current",
         "width": 32,
     }
+
+
+def test_one_preference_takes_the_place_of_a_configurations_sampler() -> None:
+    given = ["--env", "MO-HalfCheetah-v4", "--conf", "momba_plus"]
+    assert parse(given).hyperparameters["preference_sampler"] == "gain"
+    one = parse([*given, "--preference", "0.5", "0.5"])
+    assert hyperparameters_of(one)["preference_sampler"] == [0.5, 0.5]
+    both = parse([*given, "--preference", "0.5", "0.5", "--set", "preference_sampler=uniform"])
+    with pytest.raises(ValueError, match="leave one of them out"):
+        hyperparameters_of(both)
 
 
 @pytest.mark.parametrize(
