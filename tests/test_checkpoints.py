@@ -85,6 +85,10 @@ VARIANTS = {
         "preference_sampler": "gain",
         "n_envs": 2,
     },
+    "centred returns of 3 steps, resets": {
+        **{"reward_centering": True, "n_steps": 3, "critic_loss": "mse", "vector_values": True, "reset_interval": 90},
+    },
+    "TD3": {"td3_noise": 0.1, "ent_coef": 0.0, "policy_delay": 2},
     "XqcPolicy, vector": {"policy": "XqcPolicy", "vector_values": True},
     "FlashSacPolicy, HER": {"policy": "FlashSacPolicy", "her": True},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},
