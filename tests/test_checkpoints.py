@@ -16,9 +16,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Every
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor
 
-from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, make_mo_vec_env
+from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, PreferenceWrapper, make_mo_vec_env
 from sb3_momba.buffers import STORED_ARRAYS
 from sb3_momba.checkpoints.folders import CheckpointWriter, checkpoints_in, newest, number_of
 from sb3_momba.checkpoints.replay_segments import rows_of
@@ -70,14 +70,14 @@ VARIANTS = {
         **{"deterministic_exploration": True, "preference_sampler": PerStepSampler(UniformSampler(2))},
     },
     "3-step returns, four environments": {"n_steps": 3, "n_envs": 4, "gradient_steps": -1},
-    "episodes": {"train_freq": (1, "episode"), "gradient_steps": 2},
+    "episodes, TD3": {"train_freq": (1, "episode"), "gradient_steps": 2, "td3_noise": 0.1, "ent_coef": 0.0, "policy_delay": 2},
     "noise that remembers": {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5))},
     "noise that remembers, three environments": {
         **{"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.5)), "n_envs": 3},
     },
-    "held noise, a delayed actor, three environments": {
+    "held noise, a delayed actor, centred returns of 3 steps, resets, three environments": {
         **{"noise_repeat": 6, "policy_delay": 2, "target_entropy": "std_0.15", "return_scaling": "deviation", "n_envs": 3},
-        "reward_centering": True,
+        **{"reward_centering": True, "n_steps": 3, "reset_interval": 90},
     },
     "corner weights and gains, two environments": {
         "her": True,
@@ -85,10 +85,6 @@ VARIANTS = {
         "preference_sampler": "gain",
         "n_envs": 2,
     },
-    "centred returns of 3 steps, resets": {
-        **{"reward_centering": True, "n_steps": 3, "critic_loss": "mse", "vector_values": True, "reset_interval": 90},
-    },
-    "TD3": {"td3_noise": 0.1, "ent_coef": 0.0, "policy_delay": 2},
     "XqcPolicy, vector": {"policy": "XqcPolicy", "vector_values": True},
     "FlashSacPolicy, HER": {"policy": "FlashSacPolicy", "her": True},
     "fixed alpha, a falling learning rate": {"ent_coef": 0.1, "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0)},
@@ -185,6 +181,16 @@ def test_frames_that_are_stacked_begin_anew(tmp_path):
     with pytest.warns(UserWarning, match="could not be brought back.*VecFrameStack around them"):
         model = MOMBA.resume(tmp_path, make())
     assert model.learn(20, reset_num_timesteps=False).num_timesteps == 85
+
+
+def test_wrapped_environments_remember_the_episodes_that_have_ended(tmp_path):
+    def make():
+        return VecMonitor(DummyVecEnv([lambda: PreferenceWrapper(StubEnv())]))
+
+    checkpointed(make(), tmp_path, 65, 100, preference_sampler="gain")
+    with pytest.warns(UserWarning, match="could not be brought back.*VecMonitor around them"):
+        model = MOMBA.resume(tmp_path, make())
+    assert len(model.get_env().get_attr("_played")[0]) == 6
 
 
 # ----------------------------------------------------------------------------------------------------------- callbacks

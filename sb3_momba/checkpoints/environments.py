@@ -62,8 +62,8 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
     :param observations: [s, w] where the training stopped, (n_envs, observation_dim + preference_dim)
     :return: [s, w] to go on from, like observations, and the environments whose episodes could not be brought back
     """
-    env._reset_seeds()
-    env._reset_options()
+    env.unwrapped._reset_seeds()
+    env.unwrapped._reset_options()
     if isinstance(env, VecEnvWrapper):
         for index, state in enumerate(states or []):
             env.env_method("begin_replay", state, indices=[index])
