@@ -7,22 +7,15 @@ MuJoCo release from 3.2 on; `physics="current"` takes the model as the installed
 their solvers and, since 4.0, in how RK4 turns the free bodies of Ant and Humanoid, by 1e-11 to 1e-7 per step.
 """
 
-import os
 from typing import Any, ClassVar
 
-try:
-    import mujoco  # type: ignore[import-untyped]
-except RuntimeError:  # MUJOCO_GL is no name that it knows: for whoever draws to say, not for whoever simulates.
-    unknown = os.environ.pop("MUJOCO_GL", "")
-    import mujoco
-
-    os.environ["MUJOCO_GL"] = unknown
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from sb3_momba.envs.pgmorl_physics import check_physics, compile_model, driven_joints, set_damping
+from sb3_momba.envs.simulator import mujoco
 
 
 class PgmorlEnv(MujocoEnv, EzPickle):

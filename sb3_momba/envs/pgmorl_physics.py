@@ -4,8 +4,9 @@ The published fronts of these tasks come from the MuJoCo of 2020, where two rule
 of capsules, and the margin at which two geoms touch. Together they move hypervolumes by up to 4 %.
 """
 
-import mujoco  # type: ignore[import-untyped]
 import numpy as np
+
+from sb3_momba.envs.simulator import mujoco
 
 PHYSICS = ("2020", "current")
 

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import gymnasium as gym
-import mujoco  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_momba import MOMBA
 from sb3_momba.envs.making import make_env
+from sb3_momba.envs.simulator import mujoco
 from sb3_momba.explorer.stage import Camera, Image, RenderingError, Stage, backends, camera_on, follow
 from sb3_momba.pareto.evaluation import check_model_fits, probe_environment, run_jobs
 

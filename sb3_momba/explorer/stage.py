@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
+
+from sb3_momba.envs.simulator import mujoco
 
 Image = NDArray[np.uint8]
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import mujoco  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_momba.envs.making import make_env
 from sb3_momba.envs.preferences import check_preference, preference_grid
+from sb3_momba.envs.simulator import mujoco
 from sb3_momba.explorer.reading import objectives_of, read_run
 from sb3_momba.explorer.rendering import Policy, RenderingProcess, check_filmable, is_mujoco, record_episode, seconds_per_step
 from sb3_momba.explorer.stage import Camera, Image, RenderingError, Stage, body_box, camera_on
