@@ -187,10 +187,12 @@ def test_wrapped_environments_remember_the_episodes_that_have_ended(tmp_path):
     def make():
         return VecMonitor(DummyVecEnv([lambda: PreferenceWrapper(StubEnv())]))
 
-    checkpointed(make(), tmp_path, 65, 100, preference_sampler="gain")
-    with pytest.warns(UserWarning, match="could not be brought back.*VecMonitor around them"):
-        model = MOMBA.resume(tmp_path, make())
-    assert len(model.get_env().get_attr("_played")[0]) == 6
+    for steps, ended in ((5, 0), (65, 6)):
+        checkpointed(make(), tmp_path / str(steps), steps, 100, preference_sampler="gain")
+        with pytest.warns(UserWarning, match="could not be brought back.*VecMonitor around them"):
+            first, second = (MOMBA.resume(tmp_path / str(steps), make()) for _ in range(2))
+        assert len(first.get_env().get_attr("_played")[0]) == ended
+        assert np.array_equal(first._last_obs, second._last_obs)  # The preference is drawn from the same numbers.
 
 
 # ----------------------------------------------------------------------------------------------------------- callbacks

@@ -62,11 +62,12 @@ def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: n
     :param observations: [s, w] where the training stopped, (n_envs, observation_dim + preference_dim)
     :return: [s, w] to go on from, like observations, and the environments whose episodes could not be brought back
     """
-    env.unwrapped._reset_seeds()
-    env.unwrapped._reset_options()
+    env._reset_seeds()
+    env._reset_options()
     if isinstance(env, VecEnvWrapper):
         for index, state in enumerate(states or []):
-            env.env_method("begin_replay", state, indices=[index])
+            (given,) = env.env_method("begin_replay", state, indices=[index])
+            env.unwrapped._seeds[index], env.unwrapped._options[index] = given["seed"], given["options"] or {}
         _warn(list(range(env.num_envs)), f"{type(env).__name__} around them has a state of its own.")
         return np.asarray(env.reset()), list(range(env.num_envs))
     observations, lost = observations.copy(), []
