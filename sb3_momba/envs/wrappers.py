@@ -54,7 +54,6 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
             )
         self.preference_dim = preference_dim(self.n_objectives)
         self.env_index = 0
-        self._played = np.zeros((0, 2, self.n_objectives))  # preference and return of episodes that the sampler remembers
         self.set_preference_sampler(preference_sampler)
         self._fixed_preference: np.ndarray | None = None
         self._preference: np.ndarray | None = None
@@ -93,7 +92,7 @@ class PreferenceWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarr
         own = sampler.var if isinstance(sampler, CloudpickleWrapper) else sampler
         self.preference_sampler: PreferenceSampler = make_sampler("uniform" if own is None else own, self.n_objectives)
         self._n_remembered = int(getattr(self.preference_sampler, "remembered_episodes", 0))
-        self._played = self._played[:0]
+        self._played = np.zeros((0, 2, self.n_objectives))  # preference and return of episodes that the sampler remembers
 
     def set_env_index(self, index: int) -> None:
         """The environment's place in its VecEnv, for error messages."""
