@@ -364,6 +364,18 @@ def test_sb3_checker(task):
         sb3_env_checker.check_env(env, skip_render_check=True)
 
 
+def test_an_id_that_is_there_already_stays_as_it_is():
+    script = """
+import gymnasium, warnings
+warnings.simplefilter("error", UserWarning)
+gymnasium.register("MO-Hopper-v4", entry_point="somewhere:Else", max_episode_steps=7)
+import sb3_momba
+print(gymnasium.spec("MO-Hopper-v4").entry_point, gymnasium.spec("MO-Ant-v4").entry_point)
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["somewhere:Else", "sb3_momba.envs.pgmorl:MOAnt"]
+
+
 @EVERY_TASK
 def test_info_and_reset_options(task):
     env = gym.make(task)

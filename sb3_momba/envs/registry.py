@@ -93,11 +93,12 @@ def copies_of(venv: VecEnv) -> Callable[[], gym.Env]:
 
 
 for _task, (_class, _steps) in TASKS.items():
-    gym.register(
-        _task,
-        entry_point=f"sb3_momba.envs.pgmorl:{_class}",
-        max_episode_steps=_steps,
-        disable_env_checker=True,  # It does not know vector rewards.
-    )
+    if _task not in gym.registry:
+        gym.register(
+            _task,
+            entry_point=f"sb3_momba.envs.pgmorl:{_class}",
+            max_episode_steps=_steps,
+            disable_env_checker=True,  # It does not know vector rewards.
+        )
 for _task in (*CONTINUOUS, *TASKS):
     preference_id(_task)
