@@ -482,6 +482,14 @@ def test_what_the_first_mean_was_worth_is_not_kept():
     assert float(policy.return_scale.max_return) < 100
 
 
+def test_equal_rewards_leave_no_rounding_to_be_scaled_up():
+    policy = tiny_model(StubEnv(n_objectives=1), reward_centering=True).policy
+    for _ in range(300):
+        policy.observe_rewards(np.full((2, 1), -0.1, dtype=np.float32), np.zeros(2, dtype=bool))
+    assert policy.return_scale.factor() == 1
+    assert policy.reward_factor == pytest.approx(3 / 10)
+
+
 @pytest.mark.parametrize(("ending", "n_steps"), [("terminated", 1), ("terminated", 3), ("truncated", 1), ("truncated", 3)])
 @pytest.mark.parametrize("vector", [True, False], ids=["vector", "scalarised"])
 def test_centred_critics_learn_the_values_that_others_learn(ending, n_steps, vector):
