@@ -376,6 +376,11 @@ print(gymnasium.spec("MO-Hopper-v4").entry_point, gymnasium.spec("MO-Ant-v4").en
     assert run.stdout.split() == ["somewhere:Else", "sb3_momba.envs.pgmorl:MOAnt"]
 
 
+def test_whoever_draws_nothing_needs_no_opengl():
+    script = "import gymnasium, sb3_momba; gymnasium.make('MO-Ant-v4').reset()"
+    subprocess.run([sys.executable, "-c", script], env={**os.environ, "MUJOCO_GL": "vulkan"}, check=True)
+
+
 @EVERY_TASK
 def test_info_and_reset_options(task):
     env = gym.make(task)

@@ -10,12 +10,11 @@ their solvers and, since 4.0, in how RK4 turns the free bodies of Ant and Humano
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from sb3_momba.envs.pgmorl_physics import check_physics, compile_model, driven_joints, set_damping
-from sb3_momba.envs.simulator import mujoco
+from sb3_momba.envs.simulator import MujocoEnv, mujoco
 
 
 class PgmorlEnv(MujocoEnv, EzPickle):

@@ -10,5 +10,6 @@ except RuntimeError:
     import mujoco
 
     os.environ["MUJOCO_GL"] = unknown
+from gymnasium.envs.mujoco import MujocoEnv
 
-__all__ = ["mujoco"]
+__all__ = ["MujocoEnv", "mujoco"]
