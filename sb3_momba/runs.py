@@ -192,8 +192,13 @@ def check(settings: RunSettings) -> None:
 def check_empty(folder: Path) -> None:
     """:raises ValueError: for a folder that holds anything, or something that is none"""
     if folder.exists() and (not folder.is_dir() or any(file.name != LOCK for file in folder.iterdir())):
-        way_on = f", or go on with its run: --resume {folder}" if checkpoints_in(folder / CHECKPOINTS) else ""
+        way_on = f", or go on with its run: --resume {folder}" if has_checkpoint(folder) else ""
         raise ValueError(f"{folder} exists and is not an empty folder: choose another --output{way_on}.")
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run can be gone on with."""
+    return bool(checkpoints_in(folder / CHECKPOINTS))
 
 
 def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running: Any) -> RunResult:
@@ -210,7 +215,7 @@ def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running
         found = read_record(path)
         if found.error is None:
             raise ValueError(f"{folder} holds a run that has finished: there is nothing to go on with.")
-        if not checkpoints_in(folder / CHECKPOINTS):
+        if not has_checkpoint(folder):
             raise ValueError(
                 f"{folder} holds a run that was cut off before its first checkpoint: delete it, and start it again."
             )

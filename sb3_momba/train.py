@@ -20,7 +20,7 @@ import yaml
 from sb3_momba.envs.workers import WorkerError
 from sb3_momba.pareto import protocol
 from sb3_momba.recording import plain
-from sb3_momba.runs import RunResult, RunSettings, resume, run
+from sb3_momba.runs import RunResult, RunSettings, has_checkpoint, resume, run
 from sb3_momba.zoo.configuration import (
     N_TIMESTEPS,
     Configuration,
@@ -58,8 +58,9 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_momba.train", description="Train MOMBA and evaluate its Pareto front.", allow_abbrev=False
     )
-    parser.add_argument("--env", required=True, help="environment id")
-    parser.add_argument("--resume", metavar="RUN", help="go on with a run that was cut off")
+    task = parser.add_mutually_exclusive_group(required=True)
+    task.add_argument("--env", help="environment id")
+    task.add_argument("--resume", metavar="RUN", help="go on with a run that was cut off, in its folder, instead")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=whole_number, help="environment steps; by default the configuration's, or 1e6")
     parser.add_argument(
@@ -241,16 +242,23 @@ def add_running_arguments(parser: argparse._ActionsContainer) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
+    folder = None
     try:
         given = parse_resume(arguments)
-        running = {} if given is None else vars(given)
-        result = run(parse(arguments)) if given is None else resume(running.pop("resume"), **running)
+        if given is None:
+            settings = parse(arguments)
+            folder = Path(settings.output)
+            result = run(settings)
+        else:
+            folder = given.resume
+            result = resume(folder, **{name: value for name, value in vars(given).items() if name != "resume"})
     except (ValueError, MemoryError, ImportError, WorkerError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     except (KeyboardInterrupt, SystemExit) as ending:
         code = 128 + signal.SIGINT if isinstance(ending, KeyboardInterrupt) else ending.code
         if code in INTERRUPTED:
-            print("\nInterrupted. If the training had begun, go on with --resume FOLDER.", file=sys.stderr)
+            way_on = f" Go on with --resume {folder}." if folder is not None and has_checkpoint(folder) else ""
+            print(f"\nInterrupted.{way_on}", file=sys.stderr)
         sys.exit(code)
     print(report(result))
 

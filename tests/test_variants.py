@@ -478,12 +478,21 @@ def test_a_run_does_not_overwrite_another(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("ending", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)], ids=["SIGINT", "SIGTERM"])
-def test_a_signal_says_how_to_go_on(ending: BaseException, code: int, monkeypatch, capsys) -> None:
+def test_a_signal_says_how_to_go_on(ending: BaseException, code: int, monkeypatch, capsys, tmp_path) -> None:
     monkeypatch.setattr("sb3_momba.train.run", Mock(side_effect=ending))
-    with pytest.raises(SystemExit) as raised:
-        main(["--env", "mo-hopper-2obj-v5"])
-    assert raised.value.code == code
-    assert "go on with --resume" in capsys.readouterr().err
+    for checkpoint, message in ((None, "Interrupted."), ("0001-000010000", f"Interrupted. Go on with --resume {tmp_path}.")):
+        if checkpoint is not None:
+            (tmp_path / "checkpoints" / checkpoint).mkdir(parents=True)
+        with pytest.raises(SystemExit) as raised:
+            main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path)])
+        assert raised.value.code == code
+        assert capsys.readouterr().err.strip() == message
+
+
+def test_a_command_line_needs_a_task_or_a_run(capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["--steps", "1e3"])
+    assert "one of the arguments --env --resume is required" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
