@@ -235,9 +235,10 @@ def test_shipped_grids_are_of_the_seven_tasks(name: str) -> None:
         assert cell.program.parse(cell.arguments(Path("x"))).label == (cell.method or cell.conf)
 
 
-def test_shipped_variations_are_settings_that_there_are_and_no_two_are_alike() -> None:
+@pytest.mark.parametrize("name", ["ideas", "ideas_swimmer"])
+def test_shipped_variations_are_settings_that_there_are_and_no_two_are_alike(name: str) -> None:
     """On any of the tasks: a variant may have settings of its own for some."""
-    grid = read_grid("ideas")
+    grid = read_grid(name)
     for task in grid.tasks:
         seen: dict[str, str] = {}
         for cell in make_cells(grid.variants, [task], 1, as_arguments(grid.options), variations=grid.variations):
