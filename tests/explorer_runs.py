@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sb3_momba.baselines.solutions import SolutionSet
 from sb3_momba.envs.preferences import simplex_lattice
 from sb3_momba.explorer.__main__ import main
 from sb3_momba.explorer.kit import DecisionKit
@@ -119,10 +120,13 @@ def write_run(
             record.append("evaluation", steps=at, seconds=at / 10, evaluation_seconds=1.0, **metrics, values=now)
         if error is None:
             every = values[:, None] if returns is None else returns
-            front = {"preferences": preferences, "returns": values[:, None], "settings": {}}
+            lengths = np.ones(every.shape[:2], dtype=np.int64)
+            if general_policy:
+                front = {"preferences": preferences, "returns": values[:, None], "settings": {}}
+            else:
+                front = vars(SolutionSet(every, every, lengths, {}))
             record.finish(steps[-1] if steps else 0, front)
             if general_policy and returns is not None:
-                lengths = np.ones(every.shape[:2], dtype=np.int64)
                 ParetoFront(preferences, every, every, lengths, {"seed": 0}).save(folder / "front.npz")
         else:
             record.is_ended = True

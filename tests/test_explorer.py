@@ -204,6 +204,13 @@ class TestFolders:
         assert "regret-title" not in page
         assert "several policies" in page
 
+    @pytest.mark.parametrize("method", ["pgmorl", "dpmorl", "gpi_ls_utd_1"])
+    def test_runs_of_the_baselines_are_read(self, method):
+        results = Path(__file__).parents[1] / "docs" / "results" / "comparison"
+        run = read_run(next(results.glob(f"*/{method}/MO-HalfCheetah-v4/0")))
+        assert (run.preferences is None) == (not run.record.general_policy)
+        assert run.values.shape == run.record.final_values.shape
+
 
 def test_the_command_says_what_is_wrong(tmp_path):
     with pytest.raises(SystemExit, match=r"error: .*is no run"):

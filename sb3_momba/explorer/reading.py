@@ -150,11 +150,12 @@ def models_of(record: Record) -> tuple[str, str]:
 
 
 def final_front(record: Record) -> ParetoFront | None:
-    """The front with which the record of a finished run ends; None where it does not, or has no discounted returns.
+    """The front with which the record of a finished run ends; None where it does not, has no discounted returns, or is a set of
+    solutions, which answer no preference.
 
     :raises FileFormatError: if it is damaged
     """
-    if record.error is not None:
+    if record.error is not None or not record.general_policy:
         return None
     front = json.loads(record.path.read_bytes().splitlines()[-1])["front"]
     if "discounted_returns" not in front:
