@@ -90,7 +90,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     except BaseException as error:
         with contextlib.suppress(OSError):
             aside.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename in (None, os.fspath(aside)):
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, os.fspath(aside)):
             raise type(error)(error.errno, error.strerror, os.fspath(path)) from error
         raise
 

@@ -275,6 +275,11 @@ def test_an_exception_inside_atomic_write_leaves_no_file_at_all(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+def test_an_error_without_a_number_keeps_its_words(tmp_path):
+    with pytest.raises(OSError, match="cannot write mode RGBA as JPEG"), atomic_write(tmp_path / "picture.jpg"):
+        raise OSError("cannot write mode RGBA as JPEG")
+
+
 def test_until_the_new_file_is_whole_the_old_one_stands(tmp_path):
     path = tmp_path / "deep" / "file"
     with atomic_write(path) as file:
