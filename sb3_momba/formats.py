@@ -9,7 +9,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_momba.envs.preferences import ConeSampler, FixedSampler, PerStepSampler, UniformSampler
+from sb3_momba.envs.preferences import ConeSampler, FixedSampler, GainSampler, PerStepSampler, UniformSampler
 from sb3_momba.files import FileFormatError, FilePath, read_tree, register
 from sb3_momba.system import library_versions
 
@@ -87,7 +87,7 @@ def _register_noises() -> None:
 
 
 _register_box()
-for _sampler in (UniformSampler, ConeSampler, FixedSampler, PerStepSampler):
+for _sampler in (UniformSampler, ConeSampler, GainSampler, FixedSampler, PerStepSampler):
     _register_simple(_sampler, tuple(field.name for field in fields(_sampler)))
 register(TrainFreq, lambda x: [x.frequency, x.unit.value], lambda tree: TrainFreq(tree[0], TrainFrequencyUnit(tree[1])))
 _register_simple(ConstantSchedule, ("val",))

@@ -25,7 +25,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_momba import MOMBA, MlpPolicy, PreferenceReplayBuffer, SimbaPolicy, files, make_mo_vec_env
-from sb3_momba.envs.preferences import FixedSampler, PerStepSampler, UniformSampler
+from sb3_momba.envs.preferences import ConeSampler, FixedSampler, GainSampler, PerStepSampler, UniformSampler
 from sb3_momba.files import FileFormatError, atomic_write, read_tree, write_tree
 from tests.stubs import StubEnv, assert_same_tree, tiny_model
 
@@ -143,6 +143,8 @@ def test_any_string_can_be_the_key_of_an_array(key):
 
 OBJECTS = [
     UniformSampler(3),
+    ConeSampler(2, 30.0),
+    GainSampler(2, candidates=4, remembered_episodes=7),
     FixedSampler((0.25, 0.75)),
     PerStepSampler(UniformSampler(2)),
     TrainFreq(3, TrainFrequencyUnit.EPISODE),
