@@ -194,16 +194,17 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
     doubled = sorted(set(policy_kwargs) & set(INJECTED))
     if doubled:
         raise ValueError(f"policy_kwargs={{{doubled[0]!r}: ...}}: that is an argument of MOMBA itself.")
-    if policy in SHIPPED_POLICIES:
-        for name in policy_kwargs:
-            if name in OF_SACS_POLICY:
-                raise ValueError(f"policy_kwargs {name}={policy_kwargs[name]!r}: {OF_SACS_POLICY[name]}.")
-            if policy is not MlpPolicy and name in ("net_arch", "activation_fn"):
-                raise ValueError(
-                    f"policy_kwargs: {policy.__name__} has no {name}: its sizes are actor_hidden_dim, actor_blocks, "
-                    "critic_hidden_dim and critic_blocks. MlpPolicy has it."
-                )
-        check_names("policy_kwargs", policy_kwargs, policy_parameters(policy), f"{policy.__name__} has no argument")
+    if policy not in SHIPPED_POLICIES:
+        return
+    for name in policy_kwargs:
+        if name in OF_SACS_POLICY:
+            raise ValueError(f"policy_kwargs {name}={policy_kwargs[name]!r}: {OF_SACS_POLICY[name]}.")
+        if policy is not MlpPolicy and name in ("net_arch", "activation_fn"):
+            raise ValueError(
+                f"policy_kwargs: {policy.__name__} has no {name}: its sizes are actor_hidden_dim, actor_blocks, "
+                "critic_hidden_dim and critic_blocks. MlpPolicy has it."
+            )
+    check_names("policy_kwargs", policy_kwargs, policy_parameters(policy), f"{policy.__name__} has no argument")
     for name, value in policy_kwargs.items():
         if name in POLICY_SWITCHES:
             check_switch(f"policy_kwargs {name}", value)

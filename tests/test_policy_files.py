@@ -92,6 +92,19 @@ def test_a_policy_of_the_user_comes_back():
     assert_same_tree(dict(again.state_dict()), dict(policy.state_dict()))
 
 
+class PolicyWithNamedActivation(MlpPolicy):
+    """A user's policy that takes another value for an argument of MlpPolicy's name."""
+
+    def __init__(self, *args, activation_fn: str = "tanh", **kwargs):
+        super().__init__(*args, activation_fn={"tanh": th.nn.Tanh, "relu": th.nn.ReLU}[activation_fn], **kwargs)
+
+
+def test_the_values_of_a_users_policy_are_its_own_affair():
+    kwargs = {"activation_fn": "tanh", "net_arch": [8]}
+    policy = MOMBA(PolicyWithNamedActivation, StubEnv(), buffer_size=10, policy_kwargs=kwargs).policy
+    assert any(isinstance(module, th.nn.Tanh) for module in policy.modules())
+
+
 @pytest.mark.parametrize("method", ["predict", "save", "load"])
 def test_the_actor_alone_says_whom_to_ask(method):
     with pytest.raises(NotImplementedError, match=r"use policy\.predict, policy\.save and policy\.load"):
