@@ -125,16 +125,17 @@ def alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def write_tree(path: FilePath, tree: Any) -> list[str]:
+def write_tree(path: FilePath, tree: Any, whole: bool = False) -> list[str]:
     """Write a tree atomically; a file object is simply written to.
 
     Leaves are None, booleans, numbers, strings, NumPy arrays, tensors, registered objects and nameable classes; other
     callables inside dictionaries are left out with a warning.
 
+    :param whole: nothing may be left out
     :return: where in the tree something was left out, such as "data.learning_rate"
     :raises TypeError: for any other leaf, naming where it is, before anything is written
     """
-    encoder = _Encoder()
+    encoder = _Encoder(whole)
     encoded = encoder.encode(tree, "")
     text = json.dumps({"tree": encoded, "left_out": encoder.left_out}, allow_nan=False, indent=1)
     for place in encoder.left_out:
@@ -204,10 +205,10 @@ def with_existing_suffix(path: FilePath, suffix: str) -> FilePath:
 
 
 class _Encoder:
-    def __init__(self) -> None:
+    def __init__(self, whole: bool) -> None:
         self.arrays: dict[str, np.ndarray] = {}
         self.left_out: list[str] = []
-        self.inside_object = False
+        self.whole = whole
 
     def encode(self, x: Any, place: str) -> Any:
         if x is None or isinstance(x, bool | str):
@@ -241,11 +242,11 @@ class _Encoder:
 
     def _encode_whole(self, state: Any, place: str) -> Any:
         """An object's state, of which nothing may be left out: it could not be made again."""
-        outer, self.inside_object = self.inside_object, True
+        outer, self.whole = self.whole, True
         try:
             return self.encode(state, place)
         finally:
-            self.inside_object = outer
+            self.whole = outer
 
     def _encode_dict(self, x: dict[Any, Any], place: str) -> Any:
         pairs = []
@@ -254,7 +255,7 @@ class _Encoder:
             try:
                 pairs.append((key, self.encode(value, where)))
             except TypeError:
-                if self.inside_object or not callable(value):
+                if self.whole or not callable(value):
                     raise
                 self.left_out.append(where)
         if all(isinstance(key, str) for key in x) and "~" not in x:

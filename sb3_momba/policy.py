@@ -258,6 +258,7 @@ class MombaPolicy(BasePolicy):
                 "arguments": self._all_arguments,
                 "state_dict": dict(self.state_dict()),
             },
+            whole=True,
         )
 
     @property

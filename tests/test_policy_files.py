@@ -92,6 +92,18 @@ def test_a_policy_of_the_user_comes_back():
     assert_same_tree(dict(again.state_dict()), dict(policy.state_dict()))
 
 
+class Sine(th.nn.Module):
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return x.sin()
+
+
+def test_a_policy_is_saved_whole_or_not_at_all(tmp_path):
+    policy = MOMBA("MlpPolicy", StubEnv(), buffer_size=10, policy_kwargs={"activation_fn": Sine, "net_arch": [8]}).policy
+    with pytest.raises(TypeError, match="activation_fn is a type, which cannot be stored without pickle"):
+        policy.save(tmp_path / "policy")
+    assert list(tmp_path.iterdir()) == []
+
+
 class PolicyWithNamedActivation(MlpPolicy):
     """A user's policy that takes another value for an argument of MlpPolicy's name."""
 
