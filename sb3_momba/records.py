@@ -181,7 +181,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         if event["event"] == "resumed" and final_values is None:
             resumed_at = _whole(event["steps"], "steps")
             evaluations = [evaluation for evaluation in evaluations if evaluation.steps <= resumed_at]
-            error = UNENDED
+            error, traceback = UNENDED, ""
         elif error != UNENDED or final_values is not None:
             raise FileFormatError("it goes on after its end.")
         elif event["event"] == "floor":

@@ -1105,3 +1105,13 @@ def test_a_traceback_is_recorded_with_the_error(tmp_path) -> None:
     assert record.error == "RuntimeError: diverged"
     assert record.traceback.startswith("Traceback (most recent call last):")
     assert record.traceback.endswith("RuntimeError: diverged\n")
+
+
+def test_what_failed_and_went_on_has_no_traceback_of_then(tmp_path) -> None:
+    path = tmp_path / "r.jsonl"
+    with pytest.raises(RuntimeError), writer_of(path):
+        raise RuntimeError("diverged")
+    with open(path, "a") as file:
+        file.write('{"event": "resumed", "steps": 0}\n')
+    record = read_record(path)
+    assert (record.error, record.traceback) == (UNENDED, "")
