@@ -100,6 +100,16 @@ def test_optimize_maximises_the_hypervolume(folder: Path) -> None:
     assert list((folder / "tuned" / "momba").glob("report_*.csv"))
 
 
+def test_trials_are_evaluated_under_the_preferences_of_the_file(folder: Path) -> None:
+    corners = {**ENTRY, "callback": [{CALLBACK: {"preferences": [[1.0, 0.0], [0.0, 1.0]], "n_episodes": 1}}]}
+    (folder / "corners.yml").write_text(yaml.dump({TASK: corners}))
+    options = "-n 110 --n-trials 1 --n-evaluations 1 --no-optim-plots --optimization-log-path corners"
+    code, said = zoo(folder, f"optimize --env momba/{TASK} --conf corners.yml {options} -f tuned-corners")
+    assert code == 0, said
+    (evaluations,) = (folder / "corners").glob("*/pareto_evaluations.npz")
+    assert np.load(evaluations)["preferences"].tolist() == [[1, 0], [0, 1]]
+
+
 def test_shipped_configurations_and_parameters_from_the_command_line(folder: Path) -> None:
     """Without a callback in the file, rl_zoo3's own evaluation is of fronts too."""
     tiny = "policy_kwargs:dict(net_arch=[8]) buffer_size:1000 learning_starts:50 n_envs:2"

@@ -75,7 +75,8 @@ class MombaExperimentManager(exp_manager.ExperimentManager):
         if named:
             self.eval_freq = -1
             kwargs = named[0].evaluation_kwargs
-            settings = {"n_preferences": kwargs["n_preferences"], "reference_point": named[0].reference_point}
+            settings = {name: kwargs[name] for name in ("n_preferences", "preferences")}
+            settings["reference_point"] = named[0].reference_point
             self.n_eval_episodes = kwargs["n_episodes"]
         MODULE.EvalCallback = ZooEvalCallback
         MODULE.TrialEvalCallback = partial(TrialEvalCallback, **settings)
