@@ -1283,6 +1283,7 @@ def test_the_suffix_chooses_the_format(name, start, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_bytes().startswith(start)
     assert (tmp_path / name).stat().st_size > 5_000
+    assert b"Software" not in (tmp_path / name).read_bytes()
 
 
 def test_an_evaluated_front_is_drawn_as_its_mean_returns():

@@ -14,7 +14,7 @@ from sb3_momba.benchmark.results import Run, Task, compare, curve_on, cut_at, me
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
-from sb3_momba.pareto.plotting import default_style, plot_front, verbatim
+from sb3_momba.pareto.plotting import default_style, plot_front, save_figure, verbatim
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
 from sb3_momba.train import whole_number
 
@@ -237,8 +237,7 @@ def draw_curves(task: Task, path: Path) -> bool:
     axes.set(xlabel="environment steps", ylabel="hypervolume (IQM, 95 %)", title=verbatim(task.name), ylim=(0, None))
     axes.grid(alpha=0.3)
     axes.legend()
-    with atomic_write(path) as file:
-        figure.savefig(file, dpi=150, format="png")
+    save_figure(figure, path)
     return True
 
 

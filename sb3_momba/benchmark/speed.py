@@ -23,6 +23,7 @@ from sb3_momba.momba import MOMBA
 from sb3_momba.nn.products import fast_float32_products
 from sb3_momba.nn.speed import has_compiler
 from sb3_momba.pareto.evaluation import evaluate_front
+from sb3_momba.pareto.plotting import save_figure
 from sb3_momba.system import machine
 
 TASK = "MO-Hopper-v4"
@@ -151,7 +152,7 @@ def scaling_table(picture: Path | None = None) -> str:
         axes.legend()
     if picture is not None:
         figure.supylabel("time of an update / the default's")
-        figure.savefig(picture, dpi=120)
+        save_figure(figure, picture, dpi=120)
     return markdown(rows)
 
 

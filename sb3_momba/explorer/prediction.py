@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from sb3_momba import MOMBA
 from sb3_momba.explorer.decisions import Predict, leave_one_out_errors, local_error, predict_returns
 from sb3_momba.explorer.rollouts import Rollouts, critic_values
-from sb3_momba.files import atomic_write
 from sb3_momba.pareto.evaluation import ParetoFront
-from sb3_momba.pareto.plotting import COLOURS, verbatim
+from sb3_momba.pareto.plotting import COLOURS, save_figure, verbatim
 
 Array = NDArray[np.float64]
 
@@ -141,5 +140,4 @@ def draw_calibration(calibration: Calibration, objectives: Sequence[str], title:
         axes.tick_params(labelsize=8)
     every_axes[0].set_ylabel("predicted", fontsize=9)
     every_axes[0].legend(fontsize=8, title="right in all objectives", title_fontsize=8, frameon=False)
-    with atomic_write(path) as file:
-        figure.savefig(file, dpi=130, format=path.suffix.lstrip(".") or "png")
+    save_figure(figure, path, dpi=130)

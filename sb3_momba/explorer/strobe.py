@@ -16,8 +16,7 @@ from sb3_momba.envs.simulator import mujoco
 from sb3_momba.explorer.reading import objectives_of, read_run
 from sb3_momba.explorer.rendering import Policy, RenderingProcess, check_filmable, is_mujoco, record_episode, seconds_per_step
 from sb3_momba.explorer.stage import Camera, Image, RenderingError, Stage, body_box, camera_on
-from sb3_momba.files import atomic_write
-from sb3_momba.pareto.plotting import verbatim
+from sb3_momba.pareto.plotting import save_figure, verbatim
 
 SECONDS = 3.0  # of simulated time: 200 steps of the Humanoid, as in Figure 4.6
 N_PREFERENCES = 4
@@ -175,5 +174,4 @@ def _write(
         axes.spines[:].set_visible(False)
         axes.tick_params(length=0, labelsize=9, colors="#52606d")
     all_axes[-1].set_xlabel("x (m)", fontsize=9, color="#52606d")
-    with atomic_write(path) as file:
-        figure.savefig(file, dpi=150, format=path.suffix.lstrip(".") or "png")
+    save_figure(figure, path)

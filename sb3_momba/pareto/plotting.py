@@ -58,10 +58,19 @@ def plot_front(
     if any(points):
         axes.legend()
     if path is not None:
-        path = os.fspath(path)
-        with atomic_write(path) as file:
-            figure.savefig(file, dpi=150, format=os.path.splitext(path)[1].lstrip(".") or "png")
+        save_figure(figure, path)
     return figure
+
+
+def save_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
+    """Write a picture atomically, in the format of its suffix; a PNG's bytes do not name who wrote them.
+
+    :raises OSError: if the file cannot be written; an old one stands
+    :raises ValueError: for a suffix that matplotlib does not know
+    """
+    kind = os.path.splitext(path)[1].lstrip(".").lower() or "png"
+    with atomic_write(path) as file:
+        figure.savefig(file, dpi=dpi, format=kind, metadata={"Software": None} if kind == "png" else None)
 
 
 def default_style() -> contextlib.AbstractContextManager[None]:

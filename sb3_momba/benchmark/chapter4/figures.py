@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from sb3_momba.benchmark.chapter4.scores import Aggregate
 from sb3_momba.benchmark.curves import Curve, draw_curve
 from sb3_momba.benchmark.statistics import Estimate
-from sb3_momba.files import atomic_write
-from sb3_momba.pareto.plotting import COLOURS, MARKERS, default_style, label_axes, scatter_front, verbatim
+from sb3_momba.pareto.plotting import COLOURS, MARKERS, default_style, label_axes, save_figure, scatter_front, verbatim
 
 Array = NDArray[np.float64]
 STYLES = ("-", "--", ":", "-.")
@@ -182,11 +181,10 @@ def layout(n: int) -> tuple[int, int]:
 
 
 def write(figure: Figure, path: Path, has_legend: bool = True) -> None:
-    """Bytes that the numbers and the library's version alone decide; one legend for all panels."""
+    """With one legend for all panels."""
     entries = [entry for axes in figure.axes for entry in zip(*axes.get_legend_handles_labels(), strict=True)]
     named = {label: handle for handle, label in reversed(entries)}
     if has_legend and named:
         order = dict.fromkeys(label for _, label in entries)
         figure.legend([named[label] for label in order], list(order), loc="outside lower center", ncols=min(len(order), 5))
-    with atomic_write(path) as file:
-        figure.savefig(file, dpi=120, format="png", metadata={"Software": None})
+    save_figure(figure, path, dpi=120)
