@@ -243,7 +243,7 @@ def preference_grid(n_objectives: int, n_preferences: int = 100) -> np.ndarray:
     grid = simplex_lattice(n_objectives, divisions)
     if len(grid) != n_preferences:
         logger.warning(
-            "%d preferences asked for %d objectives: the nearest simplex lattice has %d.",
+            "%d preferences asked for %d objectives: the smallest simplex lattice with as many has %d.",
             n_preferences,
             n_objectives,
             len(grid),
