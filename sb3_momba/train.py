@@ -190,29 +190,36 @@ def assign(values: dict[str, Any], assignment: str, option: str = "--set") -> No
 def command_of(config: dict[str, Any]) -> list[str]:
     """The command line that a run's settings, as its record has them, come from: what differs from the defaults."""
     usual = {field.name: field.default for field in fields(RunSettings)}
-    words = ["python", "-m", "sb3_momba.train"]
-    for name in ("env", "steps", "seed", "label", "n_envs", "eval_freq", "n_preferences", "n_episodes", "device"):
-        if name in ("env", "steps", "seed") or config[name] != usual[name]:
-            words += [option(name), str(config[name])]
+    options = {name: config[name] for name in ("env", "steps", "seed")}
+    for name in ("label", "n_envs", "eval_freq", "n_preferences", "n_episodes", "device", "subprocesses"):
+        if config[name] != usual[name]:
+            options[name] = config[name]
     for name in ("reference_point", "preference", "objectives"):
         if config.get(name) is not None:
-            words += [option(name), *map(str, config[name])]
-    if config["subprocesses"]:
-        words.append("--subprocesses")
+            options[name] = config[name]
     if config["policy"] != usual["policy"]:
-        words += ["--architecture", {policy: name for name, policy in ARCHITECTURES.items()}[config["policy"]]]
+        options["architecture"] = {policy: name for name, policy in ARCHITECTURES.items()}[config["policy"]]
     defaults = flat(plain(with_defaults(config["policy"], {})))
     changed = {name: x for name, x in flat(config["hyperparameters"]).items() if name not in defaults or x != defaults[name]}
     if config.get("preference") is not None:
         del changed["preference_sampler"]
-    for option_name, values in (("--set", changed), ("--env-kwargs", config["env_kwargs"])):
-        for name, value in values.items():
-            words += [option_name, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    options |= {"set": changed, "env_kwargs": config["env_kwargs"]}
+    return ["python", "-m", "sb3_momba.train", *as_arguments(options)]
+
+
+def as_arguments(options: Mapping[str, Any]) -> list[str]:
+    """{"steps": 300, "set": {"gamma": 0.9}, "her": True} -> --steps 300 --set gamma=0.9 --her"""
+    words: list[str] = []
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(value, dict):
+            for key, item in value.items():
+                words += [option, f"{key}={item if isinstance(item, str) else json.dumps(item)}"]
+        elif isinstance(value, list):
+            words += [option, *map(str, value)]
+        else:
+            words += [option] if value is True else [option, str(value)]
     return words
-
-
-def option(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def flat(hyperparameters: dict[str, Any]) -> dict[str, Any]:

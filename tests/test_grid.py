@@ -12,10 +12,11 @@ import yaml
 from sb3_momba import train
 from sb3_momba.baselines.settings import VARIANTS
 from sb3_momba.benchmark import execution, grid
-from sb3_momba.benchmark.grid import Cell, as_arguments, cells_of, make_cells, merged, read_grid, shipped_grids
+from sb3_momba.benchmark.grid import Cell, cells_of, make_cells, merged, read_grid, shipped_grids
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.envs.registry import TASKS
 from sb3_momba.files import FileFormatError, FolderInUseError, alone_in
+from sb3_momba.train import as_arguments
 from sb3_momba.zoo.configuration import check_hyperparameters, read_configuration, with_defaults
 from tests.test_benchmark import write_record
 

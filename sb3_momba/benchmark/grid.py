@@ -31,6 +31,7 @@ from sb3_momba.benchmark.results import FIXED_PREFERENCE
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.pareto.evaluation import probe_environment
 from sb3_momba.settings import check_names, is_number, nearest, parse_ent_coef
+from sb3_momba.train import as_arguments
 from sb3_momba.zoo.configuration import literal, read_configuration
 
 SHIPPED = resources.files("sb3_momba.benchmark") / "grids"
@@ -178,21 +179,6 @@ def read_grid(name: str) -> Grid:
     if (first := Path(entries["variants"][0]).stem) in entries.get("variations", ()):
         raise ValueError(f"{name}: the variation {first!r} needs another name, this is the first variant's own name.")
     return Grid(**entries)
-
-
-def as_arguments(options: Mapping[str, Any]) -> list[str]:
-    """{"steps": 300, "set": {"gamma": 0.9}, "her": True} -> --steps 300 --set gamma=0.9 --her"""
-    words: list[str] = []
-    for name, value in options.items():
-        option = f"--{name.replace('_', '-')}"
-        if isinstance(value, dict):
-            for key, item in value.items():
-                words += [option, f"{key}={item if isinstance(item, str) else json.dumps(item)}"]
-        elif isinstance(value, list):
-            words += [option, *map(str, value)]
-        else:
-            words += [option] if value is True else [option, str(value)]
-    return words
 
 
 def make_cells(
