@@ -186,12 +186,13 @@ class TestFolders:
 
     def test_reference_points_that_differ(self, tmp_path):
         folders = [write_run(tmp_path / str(x), VALUES, PREFERENCES, reference_point=[x, x]) for x in (0.0, -1.0)]
-        runs = read_runs(folders)
-        with pytest.raises(ValueError, match=r"\[\(-1.0, -1.0\), \(0.0, 0.0\)\]: choose one, --reference-point"):
-            report.common_reference_point(runs, None)
-        assert report.common_reference_point(runs, [2, 3]).tolist() == [2, 3]
-        with pytest.raises(ValueError, match="2 numbers are needed"):
-            report.common_reference_point(runs, [2])
+        with pytest.raises(ValueError, match=r"\[\(-1.0, -1.0\), \(0.0, 0.0\)\]: choose one with --reference-point"):
+            report.write_report(folders, tmp_path / "report.html", 0)
+        with pytest.raises(ValueError, match=r"has 2 objectives in .*, the reference point \[2.0\] has 1 numbers"):
+            report.write_report(folders, tmp_path / "report.html", 0, [2])
+        assert not (tmp_path / "report.html").exists()
+        report.write_report(folders, tmp_path / "report.html", 0, [2, 3])
+        assert (tmp_path / "report.html").exists()
 
     def test_a_front_of_another_evaluation_gives_no_spread(self, tmp_path):
         folder = write_run(tmp_path / "run", VALUES, PREFERENCES, returns=np.stack([VALUES, VALUES + 8], axis=1))

@@ -92,7 +92,7 @@ def compare(records: Iterable[Record], reference_point: ArrayLike | None = None)
 
 
 def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLike | None) -> Task:
-    reference = _reference_point(name, records, reference_point)
+    reference = common_reference_point(name, records, reference_point)
     fixed = [record for record in records if is_fixed_preference(record)]
     found = [record.final_values for record in records if record.final_values is not None]
     front = convex_envelope(np.concatenate(found)) if found else np.zeros((0, len(reference)))
@@ -162,12 +162,16 @@ def is_fixed_preference(record: Record) -> bool:
     return record.label == FIXED_PREFERENCE and len(record.preferences) == 1
 
 
-def _reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
+def common_reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
+    """Of all records of a task, (n_objectives,).
+
+    :raises ValueError: if they have several and none is given, or one of another length
+    """
     points = sorted({tuple(record.reference_point.tolist()) for record in records})
     if given is None and len(points) > 1:
         raise ValueError(
-            f"The records of {name} have the reference points {points}: choose one, `benchmark report --reference-point`, or "
-            "leave the others out."
+            f"The records of {name} have the reference points {points}: choose one with --reference-point, or leave the others "
+            "out."
         )
     reference = records[0].reference_point if given is None else np.asarray(given, dtype=np.float64)
     for record in records:

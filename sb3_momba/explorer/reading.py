@@ -15,7 +15,7 @@ from sb3_momba.envs.making import make_env
 from sb3_momba.explorer.rendering import Film, Policy
 from sb3_momba.files import FileFormatError
 from sb3_momba.pareto.evaluation import ParetoFront
-from sb3_momba.pareto.metrics import expected_utility, hypervolume, non_dominated, summarise
+from sb3_momba.pareto.metrics import non_dominated, regrets, summarise
 from sb3_momba.records import FILE_NAME as RECORD_NAME
 from sb3_momba.records import Record, is_cut_off_at_its_start, read_record
 
@@ -72,10 +72,7 @@ class Run:
     @property
     def regrets(self) -> Array | None:
         """max_i w.V_i - w.V_w of each preference w, (n,), of which `preference_regret` is the mean."""
-        if self.preferences is None:
-            return None
-        utilities = self.preferences @ self.values.T
-        return np.asarray(utilities.max(axis=1) - utilities.diagonal())
+        return None if self.preferences is None else regrets(self.values, self.preferences)
 
     @property
     def on_front(self) -> NDArray[np.bool_]:
@@ -201,12 +198,5 @@ def objectives_of(record: Record) -> list[str]:
 
 
 def measure(run: Run, values: Array, reference_point: ArrayLike) -> dict[str, float]:
-    """The metrics of one evaluation of a run, or of one of its floors, under the names of `summarise`; without the regret of a
-    set of solutions, which answer no preference."""
-    if run.record.general_policy:
-        return summarise(values, run.record.preferences, reference_point)
-    return {
-        "hypervolume": hypervolume(values, reference_point),
-        "expected_utility": expected_utility(values, run.record.preferences),
-        "n_non_dominated": float(non_dominated(values).sum()),
-    }
+    """The metrics of one evaluation of a run, or of one of its floors, under the names of `summarise`."""
+    return summarise(values, run.record.preferences, reference_point, run.record.general_policy)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_momba import __version__
+from sb3_momba.benchmark.results import common_reference_point
 from sb3_momba.explorer import charts
 from sb3_momba.explorer.reading import Run, measure, objectives_of, read_runs
 from sb3_momba.explorer.rendering import FPS, Film, RenderingProcess, check_filmable, film
@@ -47,7 +48,7 @@ def write_report(
     """
     script = plotly_script()
     runs = read_runs(folders)
-    reference = common_reference_point(runs, reference_point)
+    reference = common_reference_point(runs[0].record.task, [run.record for run in runs], reference_point)
     n_films = max(5, N_FILMS // len(runs)) if n_films is None else n_films
     for run in runs:
         add_films(run, n_films)
@@ -64,22 +65,6 @@ def plotly_script() -> str:
     except ImportError as error:
         raise ImportError("A report needs the package plotly: `pip install 'sb3-momba[explorer]'`.") from error
     return str(get_plotlyjs())
-
-
-def common_reference_point(runs: Sequence[Run], given: ArrayLike | None) -> Array:
-    """
-    :raises ValueError: for several, or one of another length
-    """
-    n_objectives = runs[0].values.shape[1]
-    if given is not None:
-        reference = np.asarray(given, dtype=np.float64)
-        if reference.shape != (n_objectives,):
-            raise ValueError(f"--reference-point {given}: {n_objectives} numbers are needed, one per objective.")
-        return reference
-    points = sorted({tuple(run.record.reference_point.tolist()) for run in runs})
-    if len(points) > 1:
-        raise ValueError(f"The runs have the reference points {points}: choose one, --reference-point.")
-    return np.array(points[0])
 
 
 def add_films(run: Run, n_films: int) -> None:

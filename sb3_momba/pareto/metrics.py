@@ -57,10 +57,16 @@ def expected_utility(values: ArrayLike, preferences: ArrayLike) -> float:
 
 
 def preference_regret(values: ArrayLike, preferences: ArrayLike) -> float:
-    """The mean over w of max_i w . V_i - w . V_w, in the unit of the scalarised return: what a user loses who asks for w,
-    because the policy answers another preference better. EUM hides it. At least 0, and better when smaller.
+    """The mean of `regrets`. EUM hides it. At least 0, and better when smaller.
 
     A metric of this project; the thesis has none like it.
+    """
+    return float(regrets(values, preferences).mean())
+
+
+def regrets(values: ArrayLike, preferences: ArrayLike) -> Array:
+    """max_i w . V_i - w . V_w of each w, (n_preferences,), in the unit of the scalarised return: what a user loses who asks for
+    w, because the policy answers another preference better.
 
     :param values: V_w for each preference, in their order, (n_preferences, n_objectives)
     :param preferences: w, (n_preferences, n_objectives)
@@ -69,7 +75,7 @@ def preference_regret(values: ArrayLike, preferences: ArrayLike) -> float:
     utilities = _utilities(values, preferences)
     if utilities.shape[0] != utilities.shape[1]:
         raise ValueError(f"{utilities.shape[1]} values for {utilities.shape[0]} preferences: give one value per preference.")
-    return float((utilities.max(axis=1) - utilities.diagonal()).mean())
+    return np.asarray(utilities.max(axis=1) - utilities.diagonal())
 
 
 def inverted_generational_distance(values: ArrayLike, reference_front: ArrayLike) -> float:
