@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -227,25 +227,15 @@ def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running
             return _train(settings, ready, record, ready.model.remaining_timesteps, on_step)
 
 
-class StepCallback(BaseCallback):
-    """Tells someone how many steps there were."""
-
-    def __init__(self, on_step: Callable[[int], None]):
-        super().__init__()
-        self.on_step_of_run = on_step
-
-    def _on_step(self) -> bool:
-        self.on_step_of_run(self.num_timesteps)
-        return True
-
-
 def _train(
     settings: RunSettings, ready: Prepared, record: RecordWriter, steps: int, on_step: Callable[[int], None] | None
 ) -> RunResult:
     folder, model, evaluation = Path(settings.output), ready.model, ready.evaluation
     checkpoints = MombaCheckpointCallback(settings.checkpoint_freq, folder / CHECKPOINTS, settings.keep_checkpoints)
     try:
-        callbacks = CallbackList([evaluation, checkpoints, *([] if on_step is None else [StepCallback(on_step)])])
+        callbacks: list[BaseCallback] = [evaluation, checkpoints]
+        if on_step is not None:
+            callbacks.append(ConvertCallback(lambda *_: on_step(model.num_timesteps) or True))
         model.learn(steps, callbacks, reset_num_timesteps=model.num_timesteps == 0, progress_bar=settings.progress_bar)
     finally:
         model.save(folder / "model.zip")
