@@ -31,7 +31,7 @@ from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.speed import keep_freed_memory
 from sb3_momba.policy import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
-from sb3_momba.settings import HER_DEFAULTS, check_settings, is_number, parse_ent_coef, parse_target_entropy
+from sb3_momba.settings import HER_DEFAULTS, OF_THE_ALGORITHM, check_settings, is_number, parse_ent_coef, parse_target_entropy
 
 Self = TypeVar("Self", bound="PreferenceConditionedAlgorithm")
 
@@ -101,20 +101,12 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
 
     def _injected_policy_kwargs(self) -> dict[str, Any]:
         """What the policy must know of the algorithm; the user's `policy_kwargs` stay as they were given."""
-        return {
-            "n_objectives": self.n_objectives,
-            "critic_loss": self.critic_loss,
-            "vector_values": self.vector_values,
-            "best_return_scale": self.best_return_scale,
-            "return_scaling": self.return_scaling,
-            "reward_centering": self.reward_centering,
-            "gamma": self.gamma,
-            "deterministic_policy": self.td3_noise is not None,
-        }
+        ours = {name: getattr(self, name) for name in OF_THE_ALGORITHM}
+        return {**ours, "deterministic_policy": self.td3_noise is not None}
 
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:
         relabelling = {**HER_DEFAULTS, **(self.her_kwargs or {})} if self.her else {}
-        buffer_class: Any = self.replay_buffer_class or PreferenceReplayBuffer
+        buffer_class: Any = self.replay_buffer_class
         return buffer_class(
             self.buffer_size,
             self.observation_space,

@@ -18,7 +18,7 @@ from sb3_momba.formats import header, read_format
 from sb3_momba.nn.layers import project_weights
 from sb3_momba.nn.networks import Actor, Architecture, Critic
 from sb3_momba.nn.normalization import DeviationScale, ReturnScale, RewardCenter, RunningStatistics
-from sb3_momba.nn.values import DistributionalValue, ExpectedValue
+from sb3_momba.nn.values import DistributionalValue, ExpectedValue, ValueRepresentation
 
 POLICY_FORMAT = "sb3_momba.policy"
 Self = TypeVar("Self", bound="MombaPolicy")
@@ -102,7 +102,7 @@ class MombaPolicy(BasePolicy):
             self.return_scale: ReturnScale = DeviationScale(best_return_scale, gamma, n_objectives)
         else:
             self.return_scale = ReturnScale(best_return_scale, gamma)
-        self.value = DistributionalValue(*support, n_atoms) if critic_loss == "ce" else ExpectedValue()
+        self.value: ValueRepresentation = DistributionalValue(*support, n_atoms) if critic_loss == "ce" else ExpectedValue()
         action_dim = int(action_space.shape[0])
         half_width = th.as_tensor((action_space.high - action_space.low) / 2, dtype=th.float32)
         self.actor = Actor(

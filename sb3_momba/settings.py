@@ -33,10 +33,11 @@ BUFFER_ARGUMENTS = ("n_steps", "gamma", *HER_DEFAULTS, "seed", "handle_timeout_t
 
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
 POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")
-INJECTED = (
+# Arguments that the policy is told, and what follows from others.
+OF_THE_ALGORITHM = (
     *("n_objectives", "critic_loss", "vector_values", "best_return_scale", "return_scaling", "reward_centering", "gamma"),
-    "deterministic_policy",
 )
+INJECTED = (*OF_THE_ALGORITHM, "deterministic_policy")
 NOT_FOR_USERS = {
     *("self", "kwargs", "observation_space", "action_space", "lr_schedule", "actor_architecture", "critic_architecture"),
     *INJECTED,

@@ -68,7 +68,7 @@ def read_segments(buffer: PreferenceReplayBuffer, checkpoint: Checkpoint, state:
         put_rows(buffer, arrays, first, end, oldest)
         reached = end
     if n_added > 0:
-        if reached != n_added - 1 and not (n_added == 1 and reached == 0):
+        if reached != n_added - 1:
             raise FileFormatError(f"{checkpoint.folder}: its segments end at row {reached}, not at {n_added - 1}.")
         put_rows(buffer, state["newest"], n_added - 1, n_added, oldest)
     buffer.n_added, buffer.pos, buffer.full = n_added, n_added % buffer.buffer_size, n_added >= buffer.buffer_size
