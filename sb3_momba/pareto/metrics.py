@@ -60,6 +60,10 @@ def preference_regret(values: ArrayLike, preferences: ArrayLike) -> float:
     """The mean of `regrets`. EUM hides it. At least 0, and better when smaller.
 
     A metric of this project; the thesis has none like it.
+
+    :param values: V_w for each preference, in their order, (n_preferences, n_objectives)
+    :param preferences: w, (n_preferences, n_objectives)
+    :raises ValueError: as `regrets`
     """
     return float(regrets(values, preferences).mean())
 
