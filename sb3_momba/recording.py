@@ -5,6 +5,7 @@ import json
 import math
 import os
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from traceback import format_exception
 from types import TracebackType
@@ -114,8 +115,8 @@ def _as_list(x: Any) -> Any:
 
 
 def plain(x: Any) -> Any:
-    """A setting as strict JSON can hold it: classes and functions by their names, objects as their attributes, numbers
-    that are not finite as text."""
+    """A setting as strict JSON can hold it: classes and functions by their names, those without one of their own by their line
+    too, objects as their attributes, numbers that are not finite as text."""
     if isinstance(x, dict):
         return {str(key): plain(value) for key, value in x.items()}
     if isinstance(x, list | tuple):
@@ -126,6 +127,9 @@ def plain(x: Any) -> Any:
         return str(x)
     if x is None or isinstance(x, bool | int | float | str):
         return x
+    if isinstance(x, partial):
+        return {"class": qualified_name(partial), **plain({"func": x.func, "args": x.args, "keywords": x.keywords})}
     if hasattr(x, "__qualname__"):
-        return qualified_name(x)
+        line = f":{x.__code__.co_firstlineno}" if "<" in x.__qualname__ and hasattr(x, "__code__") else ""
+        return qualified_name(x) + line
     return {"class": qualified_name(type(x)), **plain(getattr(x, "__dict__", {}))}

@@ -14,6 +14,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -347,6 +348,19 @@ def test_settings_that_differ_are_written_differently() -> None:
     """A sampler is a setting: two of different angles are two methods."""
     narrow, wide = (plain(ConeSampler(2, angle)) for angle in (22.5, 45.0))
     assert narrow != wide
+
+
+def test_functions_of_other_arguments_or_lines_are_written_differently() -> None:
+    assert plain(partial(pow, 2, exp=3)) == {
+        "class": "functools.partial",
+        "func": "builtins.pow",
+        "args": [2],
+        "keywords": {"exp": 3},
+    }
+    one = plain(lambda rng: rng.dirichlet([1, 1]))
+    other = plain(lambda rng: rng.dirichlet([1, 9]))
+    assert re.fullmatch(r"tests\.test_records\..*<lambda>:\d+", one)
+    assert one != other
 
 
 def test_reference_points_of_the_tasks() -> None:
