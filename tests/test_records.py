@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, recording, system
 from sb3_momba.envs.making import make_mo_vec_env
@@ -205,6 +206,20 @@ def test_seconds_are_of_training_and_evaluations_apart(tmp_path, monkeypatch) ->
     evaluations = [line for line in lines_of(writer.path) if line["event"] == "evaluation"]
     times = [[line[name] for name in ("steps", "seconds", "cpu_seconds", "evaluation_seconds")] for line in evaluations]
     assert times == [[10, 10, 5, 100], [20, 20, 10, 200], [30, 30, 15, 300]]
+
+
+def test_processor_time_is_not_noted_where_other_processes_work_for_the_training(tmp_path) -> None:
+    writer = writer_of(tmp_path / "record.jsonl")
+    callback = ParetoEvalCallback(
+        StubEnv, eval_freq=10, n_preferences=3, n_episodes=1, callback_after_eval=RecordCallback(writer)
+    )
+    env = make_mo_vec_env(StubEnv, 2, vec_env_cls=SubprocVecEnv)
+    tiny_model(env, learning_starts=100).learn(20, callback=callback)
+    env.close()
+    evaluations = [line for line in lines_of(writer.path) if line["event"] == "evaluation"]
+    assert [("seconds" in line, "cpu_seconds" in line) for line in evaluations] == [(True, False)] * 2
+    (record,) = find_records([writer.path])
+    assert [evaluation.cpu_seconds for evaluation in read_record(record).evaluations] == [None, None]
 
 
 def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:

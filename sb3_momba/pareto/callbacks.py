@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.logger import Figure as LoggedFigure
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.registry import copies_of
@@ -257,15 +257,18 @@ class RecordCallback(BaseCallback):
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Of training so far, without evaluations: by the wall, and of this process's cores."""
+        """Of training so far, without evaluations: by the wall, and of this process's cores, unless others work for it."""
         spent = self.parent.evaluation_seconds
-        return {name: round(clock() - self.started[name] - spent[name], 3) for name, clock in CLOCKS.items()}
+        noted = {name: round(clock() - self.started[name] - spent[name], 3) for name, clock in CLOCKS.items()}
+        if isinstance(self.training_env.unwrapped, SubprocVecEnv):
+            del noted["cpu_seconds"]
+        return noted
 
     def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.before = state["seconds"]
+        self.before = {**self.before, **state["seconds"]}
 
     def _on_step(self) -> bool:
         self.record.append(
