@@ -7,8 +7,9 @@ A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has a
   `general_policy`, `parameters` (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
 - `floor`, one for each policy that learned nothing: `policy`, `values` (n, n_objectives) and the metrics.
 - `evaluation`, one for each point of the curve: `steps`, which rise, `seconds` (of training, without evaluations),
-  `cpu_seconds` (the same, of processor time), `evaluation_seconds` (so far), the metrics and `values` (n, n_objectives); and
-  `extra_steps` of a method that plays episodes for itself which are not among its `steps`: how many steps they had so far.
+  `cpu_seconds` (the same, of processor time; not where environments have processes of their own), `evaluation_seconds` (so
+  far), the metrics and `values` (n, n_objectives); and `extra_steps` of a method that plays episodes for itself which are not
+  among its `steps`: how many steps they had so far.
 - `resumed`, where the run went on from a checkpoint: its `steps` (evaluations after them were made again, and the later ones
   count), `versions`, `machine`, `git_revision` and `started`.
 - `end`, the last line: `status`. A "finished" run has its `steps`, perhaps `extra_steps`, and its final `front`: `returns` and
@@ -68,7 +69,8 @@ class Evaluation:
 class Record:
     """A record as it was read. `error` is None for a run that finished; one without an end counts as failed. `traceback` is
     empty where none was recorded. `extra_steps` are those of episodes that the method played for itself, beside its steps. Of a
-    run that is looked at as it stood before its end, `whole` is the record to its end."""
+    run that is looked at as it stood before its end, `whole` is the record to its end. `resumed` are the lines with which
+    it went on."""
 
     path: Path
     label: str
@@ -88,6 +90,7 @@ class Record:
     traceback: str = ""
     extra_steps: int = 0
     whole: "Record | None" = None
+    resumed: tuple[dict[str, Any], ...] = ()
 
     @property
     def task(self) -> str:
@@ -219,6 +222,7 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
         error=error,
         traceback=traceback,
         extra_steps=extra_steps,
+        resumed=tuple(event for event in events if event["event"] == "resumed"),
     )
 
 

@@ -669,6 +669,7 @@ def test_a_run_that_failed_later_had_finished_its_first_steps(fake) -> None:
     [
         (long(), True, "cannot be cut at 15 steps, leave it out: it was evaluated at 10, 20"),
         (long(learning_rate="lin_3e-4_0"), True, "its learning rate, lin_3e-4_0, depends on how many it was asked for, 30"),
+        (long(learning_rate={"class": "LinearSchedule", "start": 3e-4}), True, "its learning rate, .*, depends on how many"),
         (long(), False, "what it trains depends on how many it was asked for, 30"),
     ],
 )
@@ -704,7 +705,35 @@ def test_bad_steps_are_named(fake, tmp_path, capsys, steps: str, message: str) -
 def test_a_curve_that_stops_short_of_a_common_step_ends_there(fake) -> None:
     """Evaluated last at 25 of 30 steps."""
     runs = curves_of(fake, ({10: 2, 20: 4, 30: 6}, True), ({15: 3, 25: 5}, False))
-    np.testing.assert_allclose(curve_on(runs)[1], [[2, 4, 6], [3, 4, 0]])
+    steps, curves = curve_on(runs)
+    np.testing.assert_array_equal(steps, [20, 30])
+    np.testing.assert_allclose(curves, [[4, 6], [4, 0]])
+
+
+def test_who_is_evaluated_late_is_not_credited_before_with_what_it_had_learned_then(fake) -> None:
+    often = {10: 1, 20: 2, 30: 3, 40: 4}
+    runs = curves_of(fake, (often, True), ({20: 4, 40: 6}, True))
+    steps, curves = curve_on(runs)
+    np.testing.assert_array_equal(steps, [20, 30, 40])
+    np.testing.assert_allclose(curves, [[2, 3, 4], [4, 5, 6]])
+    np.testing.assert_allclose(areas_under_curve(runs), [3, 5])
+    assert np.isnan(areas_under_curve(curves_of(fake, (often, True), ({40: 4}, True)))).all()
+
+
+def test_one_clock_for_all_runs_of_a_task(fake) -> None:
+    """Processor time where all have it, the wall's where one lacks it."""
+
+    def with_processor_time(record: Record) -> Record:
+        text = record.path.read_text().replace('"seconds": ', '"cpu_seconds": 0.5, "seconds": ')
+        record.path.write_text(text)
+        return read_record(record.path)
+
+    first, second = (fake(FRONT, {10: FRONT, 20: FRONT}, seed=seed) for seed in range(2))
+    first = with_processor_time(first)
+    task = only(compare([first, second]))
+    assert (task.clock, task.seconds) == ("seconds", 2)
+    task = only(compare([first, with_processor_time(second)]))
+    assert (task.clock, task.seconds) == ("cpu_seconds", 0.5)
 
 
 def test_curves_of_runs_that_all_failed(fake) -> None:
@@ -871,6 +900,38 @@ def test_a_report_without_floors_leaves_blank_what_is_unknown_of_a_run_that_fail
     assert rows_of(text, "b")[0][4:] == ["0", "2.667", "", "0", "", ""]
     text = report_of(tmp_path / "nothing", [fake(None, error=BAD, floors={}, label="b")])
     assert rows_of(text, "b")[0][4:] == ["0", "", "", "", "", ""]
+
+
+def test_a_report_says_where_hypervolumes_compare_nothing(fake, tmp_path) -> None:
+    made = [fake([[-1.0, -x]] * 3, label=label, env=env) for env in "EF" for label, x in (("good", 1), ("bad", 9))]
+    made += [fake(box(x), label=label, env="G") for label, x in (("good", 9.0), ("bad", 1.0))]
+    text = report_of(tmp_path / "report", made)
+    assert text.count("**Nothing lies above the reference point") == 2
+    assert rows_of(text, "good")[-1] == ["good", "1 (1 tasks)", ""]
+
+
+def test_a_report_names_settings_that_are_not_the_same_on_all_tasks(fake, tmp_path) -> None:
+    settings = {"hyperparameters": {**CONFIG["hyperparameters"], "gamma": 0.9}}
+    made = [fake(FRONT), fake(FRONT, env="F", settings=settings), fake(FRONT, label="b"), fake(FRONT, label="b", env="F")]
+    text = report_of(tmp_path / "report", made, "b")
+    assert text.count(" Not on all tasks with the same settings: a (gamma).") == 2
+
+
+def test_a_report_names_what_a_resumed_run_went_on_with(fake, tmp_path) -> None:
+    record = fake(FRONT, error="cut off")
+    lines = record.path.read_text().splitlines(keepends=True)
+    went_on = {
+        "event": "resumed",
+        "steps": 0,
+        "versions": {"torch": "9"},
+        "machine": {"cores": 64},
+        "git_revision": "abc-dirty",
+    }
+    record.path.write_text("".join([*lines[:-1], json.dumps(went_on) + "\n", lines[-1]]))
+    text = report_of(tmp_path / "report", [read_record(record.path)])
+    assert "- Versions: torch 9\n" in text
+    assert "- Machine: cores 64\n" in text
+    assert "- Git revision: abc-dirty\n" in text
 
 
 @pytest.mark.parametrize("curve", [{}, {10: box(1.0), 20: box(2.0)}], ids=["never evaluated", "evaluated"])

@@ -2,14 +2,16 @@
 
 import argparse
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_momba.benchmark.curves import curve_through, draw_curve
+from sb3_momba.benchmark.methods import differing, method_settings
 from sb3_momba.benchmark.results import Run, Task, compare, curve_on, cut_at, median_run, parameters_of
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
@@ -26,6 +28,7 @@ COLUMNS = {
     "curve over steps": "mean_over_steps",
     "curve over time": "mean_over_time",
 }
+CLOCKS = {"cpu_seconds": "of one processor", "seconds": "by the wall"}
 EXTRA_STEPS = "Extra steps: of episodes that a method plays for itself, which are not among its steps.\n"
 NORMALISED = ("hypervolume", "expected utility", "curve over steps", "curve over time")
 EXPLANATION = """\
@@ -35,8 +38,8 @@ that failed or did not end counts with the hypervolume 0 and with the worst expe
 finished runs; regret is of the finished ones. IGD is measured on [0, 1] axes to the convex envelope of all final solutions in
 this report (section 4.4), so it changes with the records; there is none where the envelope is one point. The two columns of
 the curve are mean hypervolumes, areas under it divided by its length: over steps from the first evaluation that all methods
-of the task have to the last; over time up to the seconds of training (of one processor, without evaluations) that every
-finished run had, from the better of the policies that learned nothing to the first evaluation in a straight line.
+of the task have to the last; over time up to the seconds of training (without evaluations) that every finished run had, from
+the better of the policies that learned nothing to the first evaluation in a straight line.
 """
 
 
@@ -55,7 +58,12 @@ def write_report(tasks: Sequence[Task], records: Sequence[Record], folder: Path,
     names = file_names([task.name for task in tasks])
     for task, name in zip(tasks, names, strict=True):
         parts.append(f"## {task.name}\n")
-        parts.append(f"Reference point {task.reference_point.tolist()}; curves over time up to {task.seconds:,.0f} s.\n")
+        duration = f"{task.seconds:,.0f} s {CLOCKS[task.clock]}"
+        parts.append(f"Reference point {task.reference_point.tolist()}; curves over time up to {duration}.\n")
+        if compares_nothing(task):
+            parts.append(
+                "**Nothing lies above the reference point: hypervolumes are 0 and compare nothing; choose another.**\n"
+            )
         parts.append(task_table(task))
         parts += [EXTRA_STEPS] * has_extra_steps(task)
         parts += [f"Recorded more than once: {repeated}.\n" for repeated in repeated_seeds(task)]
@@ -113,6 +121,12 @@ def has_unequal_budgets(task: Task) -> bool:
     return max(steps, default=0) > 1.01 * min(steps, default=0)
 
 
+def compares_nothing(task: Task) -> bool:
+    """Whether no run has a hypervolume, though some finished."""
+    runs = [run for runs in task.methods.values() for run in runs]
+    return any(run.is_finished for run in runs) and not any(run.hypervolume > 0 for run in runs)
+
+
 def last_step(runs: Sequence[Run]) -> int:
     return max((int(run.steps[-1]) for run in runs if len(run.steps)), default=0)
 
@@ -136,7 +150,8 @@ def task_table(task: Task) -> str:
 
 
 def comparison_table(tasks: Sequence[Task]) -> str:
-    """P(row > column) in hypervolume, over the tasks that both were run on."""
+    """P(row > column) in hypervolume, over the tasks that both were run on and on which it tells anything."""
+    tasks = [task for task in tasks if not compares_nothing(task)]
     names = sorted({name for task in tasks for name in task.methods})
     if len(names) < 2:
         return ""
@@ -155,6 +170,7 @@ def comparison_table(tasks: Sequence[Task]) -> str:
     unequal = [task.name for task in tasks if has_unequal_budgets(task)]
     if unequal:
         introduction += f" Methods had unequal numbers of steps on {', '.join(unequal)}."
+    introduction += told_of_settings(tasks)
     return introduction + "\n\n" + markdown(rows)
 
 
@@ -169,8 +185,21 @@ def aggregate_table(tasks: Sequence[Task], baseline: str) -> str:
         shared = [methods for methods in with_baseline if name in methods]
         cells = [normalised(shared, name, baseline, COLUMNS[column]) for column in NORMALISED]
         rows.append([name, str(len(shared)), *cells])
-    introduction = f"In units of the IQM of {one_line(baseline)} on each task; the IQM is over all runs of all tasks.\n\n"
-    return "## Aggregate\n\n" + introduction + markdown(rows)
+    introduction = f"In units of the IQM of {one_line(baseline)} on each task; the IQM is over all runs of all tasks."
+    return f"## Aggregate\n\n{introduction}{told_of_settings(tasks)}\n\n{markdown(rows)}"
+
+
+def told_of_settings(tasks: Sequence[Task]) -> str:
+    """A sentence on methods whose settings are not the same on all tasks; empty where there are none."""
+    of_methods: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for task in tasks:
+        for name, runs in task.methods.items():
+            of_methods[name].append(method_settings(runs[0].record))
+    told = []
+    for name, several in sorted(of_methods.items()):
+        if settings := differing(several):
+            told.append(f"{one_line(name)} ({', '.join(one.split('.')[-1] for one in settings)})")
+    return f" Not on all tasks with the same settings: {'; '.join(told)}." if told else ""
 
 
 def normalised(tasks: Sequence[dict[str, list[Run]]], name: str, baseline: str, column: str) -> str:
@@ -208,7 +237,8 @@ def provenance(records: Sequence[Record]) -> str:
     failed_later = sum(cut.error is None and one.error is not None for one, cut in whole)
     lines += [f"- Did not finish after that: {failed_later}"] * (failed_later > 0)
     for title, entry in (("Versions", "versions"), ("Machine", "machine"), ("Git revision", "git_revision")):
-        for made in dict.fromkeys(describe(record.start.get(entry)) for record in records):
+        parts = [part for record in records for part in (record.start, *record.resumed)]
+        for made in dict.fromkeys(describe(part.get(entry)) for part in parts):
             lines.append(f"- {title}: {made}")
     return "\n".join(lines) + "\n"
 

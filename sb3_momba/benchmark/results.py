@@ -3,12 +3,13 @@
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 
+from sb3_momba.benchmark.methods import name_methods
 from sb3_momba.pareto.metrics import (
     convex_envelope,
     expected_utility,
@@ -17,15 +18,12 @@ from sb3_momba.pareto.metrics import (
     preference_regret,
 )
 from sb3_momba.records import Record
-from sb3_momba.zoo.configuration import with_later_settings
 
 Array = NDArray[np.float64]
 Metric = Literal["hypervolume", "expected_utility"]
 
 # The label of runs that were trained and evaluated for one preference alone: points of a front that they form together (4.2.4).
 FIXED_PREFERENCE = "fixed_preference"
-# Settings in which runs of one method may differ.
-NOT_THE_METHOD = ("env", "env_kwargs", "seed", "label", "objectives", "reference_point", "device", "subprocesses", "eval_freq")
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class Run:
     A run that failed or did not end counts with the hypervolume 0 and with the worst expected utility and distance among the
     floors and all finished runs. Its regret is unknown: standing still regrets nothing.
 
-    :param seconds: of training, at each of `steps`; of processor time where it was recorded
+    :param seconds: of training, at each of `steps`; see `Task.clock`
     :param curve: hypervolume at each of them
     :param utility_curve: expected utility at each of them
     :param mean_over_steps: of the curve, see `areas_under_curve`
@@ -65,6 +63,7 @@ class Task:
 
     :param methods: runs by the method's name, without those of a fixed preference
     :param seconds: of training that every method had
+    :param clock: "cpu_seconds" where all its records have those, else "seconds"
     :param floors: hypervolume, expected utility and distance of policies that learned nothing, by name
     :param reference_front: the convex envelope of the final solutions of all methods (section 4.4), (n, n_objectives)
     :param fixed_preference: records of runs for one preference each
@@ -76,6 +75,7 @@ class Task:
     floors: dict[str, tuple[float, float, float]]
     methods: dict[str, list[Run]]
     seconds: float
+    clock: Literal["seconds", "cpu_seconds"]
     fixed_preference: list[Record] = field(default_factory=list)
 
 
@@ -98,7 +98,7 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
     front = convex_envelope(np.concatenate(found)) if found else np.zeros((0, len(reference)))
     records = [record for record in records if not is_fixed_preference(record)]
     if not records:
-        return Task(name, reference, front, {}, {}, 0.0, fixed)
+        return Task(name, reference, front, {}, {}, 0.0, "seconds", fixed)
     _check_protocol(name, records)
     final = [record.final_values for record in records if record.final_values is not None]
     preferences = records[0].preferences
@@ -113,8 +113,10 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
     }
     earned = [*floors.values()]
     earned += [(0.0, expected_utility(values, preferences), normalized_distance(values, front)) for values in final]
+    noted = all(evaluation.cpu_seconds is not None for record in records for evaluation in record.evaluations)
+    clock: Literal["seconds", "cpu_seconds"] = "cpu_seconds" if noted else "seconds"
     methods = {
-        method: [_score(record, reference, front, earned) for record in its_records]
+        method: [_score(record, reference, front, earned, clock) for record in its_records]
         for method, its_records in name_methods(records).items()
     }
     first, seconds, start = (
@@ -131,7 +133,7 @@ def _compare_task(name: str, records: Sequence[Record], reference_point: ArrayLi
         ]
         for method, runs in methods.items()
     }
-    return Task(name, reference, front, floors, methods, seconds, fixed)
+    return Task(name, reference, front, floors, methods, seconds, clock, fixed)
 
 
 def cut_at(record: Record, steps: int) -> Record:
@@ -144,8 +146,8 @@ def cut_at(record: Record, steps: int) -> Record:
     if record.planned_steps <= steps:
         return record
     cannot = f"{record.path} cannot be cut at {steps:,} steps, leave it out"
-    rate = flat(record.config).get("hyperparameters.learning_rate", 0.0)
-    if not record.general_policy or not isinstance(rate, float):
+    rate = record.config.get("hyperparameters", {}).get("learning_rate", 0.0)
+    if not record.general_policy or not isinstance(rate, int | float):
         what = "what it trains" if not record.general_policy else f"its learning rate, {rate},"
         raise ValueError(f"{cannot}: {what} depends on how many it was asked for, {record.planned_steps:,}.")
     before = [evaluation for evaluation in record.evaluations if evaluation.steps <= steps]
@@ -197,10 +199,12 @@ def _check_protocol(name: str, records: Sequence[Record]) -> None:
             )
 
 
-def _score(record: Record, reference_point: Array, front: Array, earned: Sequence[tuple[float, float, float]]) -> Run:
+def _score(
+    record: Record, reference_point: Array, front: Array, earned: Sequence[tuple[float, float, float]], clock: str
+) -> Run:
     """:param earned: hypervolume, expected utility and distance of floors and finished runs"""
     steps = np.array([evaluation.steps for evaluation in record.evaluations], dtype=np.float64)
-    seconds = np.array([e.seconds if e.cpu_seconds is None else e.cpu_seconds for e in record.evaluations])
+    seconds = np.array([getattr(evaluation, clock) for evaluation in record.evaluations])
     curve = np.array([hypervolume(evaluation.values, reference_point) for evaluation in record.evaluations])
     utility_curve = np.array([expected_utility(evaluation.values, record.preferences) for evaluation in record.evaluations])
     values = record.final_values
@@ -230,52 +234,8 @@ def normalized_distance(values: Array, front: Array) -> float:
     return inverted_generational_distance((values - nadir) / span, (front - nadir) / span)
 
 
-def name_methods(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Records by their label; where those of one label differ in settings, the differing ones are appended to the name."""
-    by_label: dict[str, list[Record]] = defaultdict(list)
-    for record in records:
-        by_label[record.label].append(record)
-    methods: dict[str, list[Record]] = defaultdict(list)
-    for label in sorted(by_label):
-        settings = [method_settings(record) for record in by_label[label]]
-        names = sorted({name for one in settings for name in one})
-        differing = [name for name in names if len({repr(one.get(name)) for one in settings}) > 1]
-        for record, one in zip(by_label[label], settings, strict=True):
-            suffix = ", ".join(f"{name.split('.')[-1]}={setting_text(one.get(name))}" for name in differing)
-            methods[f"{label} ({suffix})" if suffix else label].append(record)
-    return dict(methods)
-
-
-def method_settings(record: Record) -> dict[str, Any]:
-    """The settings in which two runs of one method must not differ, flat."""
-    return flat({k: v for k, v in with_later_settings(record.config).items() if k not in NOT_THE_METHOD})
-
-
-def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"a": {"b": 1}} -> {"a.b": 1.0}: 1 and 1.0 are the same setting, in lists too."""
-    found: dict[str, Any] = {}
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            found.update(flat(value, f"{prefix}{name}."))
-        else:
-            found[f"{prefix}{name}"] = _with_floats(value)
-    return found
-
-
-def _with_floats(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_with_floats(one) for one in value]
-    return float(value) if type(value) is int else value
-
-
-def setting_text(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(setting_text, value))}]"
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
-
-
 def curve_on(runs: Sequence[Run], metric: Metric = "hypervolume") -> tuple[Array, Array]:
-    """The curves of one method's runs on common steps: (n,) and (n_runs, n).
+    """The curves of one method's runs on common steps, from where all have been evaluated: (n,) and (n_runs, n).
 
     After its last evaluation a run that failed has what it counts with, the hypervolume 0, up to the steps that it was meant
     to have.
@@ -284,6 +244,7 @@ def curve_on(runs: Sequence[Run], metric: Metric = "hypervolume") -> tuple[Array
     planned = max((run.record.planned_steps for run in runs if not run.is_finished), default=0)
     if len(steps) and planned > steps[-1]:
         steps = np.append(steps, np.unique([steps[-1] + 1, planned]))
+    steps = steps[steps >= max((run.steps[0] for run in runs if len(run.steps)), default=0.0)]
     curves = []
     for run in runs:
         curve = run.curve if metric == "hypervolume" else run.utility_curve

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_momba import MOMBA
-from sb3_momba.benchmark.results import method_settings
+from sb3_momba.benchmark.methods import method_settings
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.explorer.kit import DecisionKit
 from sb3_momba.explorer.prediction import Calibration, calibrate, draw_calibration
