@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Each test process computes on one thread; two of them run side by side.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test browser lint known-fronts first-records evidence comparison beyond ideas reduced rounding sweep-throughput speed torture compat docs linkcheck clean
+.PHONY: demo test browser lint known-fronts first-records evidence wall-clock comparison beyond ideas reduced rounding sweep-throughput speed torture compat docs linkcheck clean
 
 demo: $(VENV)/installed
 	$(BIN)/python examples/demo.py
@@ -42,6 +42,11 @@ evidence: $(VENV)/installed
 	$(BIN)/python -m sb3_momba.benchmark run --conf momba her_par $(EVIDENCE) --auto-ent-coef 0.01 \
 		--set precision=auto --set compile=true --output runs/evidence/momba
 	$(BIN)/python -m sb3_momba.benchmark report runs/evidence
+
+# CAPQL for as long as Momba takes: six hours of one core.
+wall-clock: $(VENV)/installed
+	$(ONE_THREAD) $(BIN)/python -m sb3_momba.benchmark run --conf capql_uniform --env MO-HalfCheetah-v4 MO-Hopper-v4 --seeds 4 \
+		--steps 3e5 --eval-freq 1e4 --label "capql_uniform, as long" --output runs/wall_clock
 
 # The baselines beside it at the same number of steps (two hours of one core), and PGMORL and DPMORL at 1,000,000 (three hours).
 EQUAL := --env MO-HalfCheetah-v4 MO-Walker2d-v4 MO-Hopper-v4 --seeds 3
