@@ -495,8 +495,12 @@ def test_a_second_signal_does_not_wait_for_the_checkpoint(tmp_path, monkeypatch)
             return True
 
     callback = MombaCheckpointCallback(100, tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        new_model(StubEnv()).learn(10, [Impatient(), callback])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # A job in the background begins with SIGINT ignored.
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            new_model(StubEnv()).learn(10, [Impatient(), callback])
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert checkpoints_in(tmp_path) == []
 
 
