@@ -75,7 +75,7 @@ beyond: $(VENV)/installed
 		--eval-freq 1e4 --output runs/beyond/long
 	$(BIN)/python -m sb3_momba.benchmark report docs/results/evidence runs/beyond --output runs/beyond
 
-# What each idea gives to it, on HalfCheetah at a learning rate that falls as fast as over 100,000 steps: 62 runs and 20 of some ten
+# What each idea gives to it, on HalfCheetah at a learning rate that falls as fast as over 100,000 steps: 62 runs and 18 of some ten
 # minutes of one core.
 IDEAS := --seeds 2 --steps 3e4 --set precision=auto --set compile=true
 
