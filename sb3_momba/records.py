@@ -26,13 +26,13 @@ A record without an `end` is of a run that still goes on or was killed. The metr
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sb3_momba.envs.registry import raw_id
 from sb3_momba.files import FileFormatError, refuse_constant
@@ -252,3 +252,24 @@ def _numbers(x: Any, name: str, shape: tuple[int | None, ...]) -> Array:
     if not np.isfinite(array).all():
         raise FileFormatError(f"{name} holds a number that is not finite.")
     return array
+
+
+def common_reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
+    """Of all records of a task, (n_objectives,).
+
+    :raises ValueError: if they have several and none is given, or one of another length
+    """
+    points = sorted({tuple(record.reference_point.tolist()) for record in records})
+    if given is None and len(points) > 1:
+        raise ValueError(
+            f"The records of {name} have the reference points {points}: choose one with --reference-point, or leave the others "
+            "out."
+        )
+    reference = records[0].reference_point if given is None else np.asarray(given, dtype=np.float64)
+    for record in records:
+        if record.preferences.shape[1] != len(reference):
+            raise ValueError(
+                f"{name} has {record.preferences.shape[1]} objectives in {record.path}, the reference point "
+                f"{reference.tolist()} has {len(reference)} numbers: report tasks of other numbers of objectives apart."
+            )
+    return reference

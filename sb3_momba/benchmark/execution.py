@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sb3_momba.benchmark.grid import Cell, checked
-from sb3_momba.benchmark.methods import flat
 from sb3_momba.checkpoints.folders import newest
 from sb3_momba.files import LOCK, FolderInUseError, alone_in
+from sb3_momba.methods import flat
 from sb3_momba.records import FILE_NAME, UNENDED, is_cut_off_at_its_start, read_record
 from sb3_momba.runs import CHECKPOINTS
 from sb3_momba.zoo.configuration import with_later_settings

@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_momba.benchmark.curves import curve_through, draw_curve
-from sb3_momba.benchmark.methods import differing, method_settings
 from sb3_momba.benchmark.results import Run, Task, compare, curve_on, cut_at, median_run, parameters_of
 from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probability_of_improvement
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
+from sb3_momba.methods import differing, method_settings
 from sb3_momba.pareto.plotting import default_style, plot_front, save_figure, verbatim
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
 from sb3_momba.train import whole_number

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 
-from sb3_momba.benchmark.methods import name_methods
+from sb3_momba.methods import name_methods
 from sb3_momba.pareto.metrics import (
     convex_envelope,
     expected_utility,
@@ -17,7 +17,7 @@ from sb3_momba.pareto.metrics import (
     inverted_generational_distance,
     preference_regret,
 )
-from sb3_momba.records import Record
+from sb3_momba.records import Record, common_reference_point
 
 Array = NDArray[np.float64]
 Metric = Literal["hypervolume", "expected_utility"]
@@ -162,27 +162,6 @@ def cut_at(record: Record, steps: int) -> Record:
 
 def is_fixed_preference(record: Record) -> bool:
     return record.label == FIXED_PREFERENCE and len(record.preferences) == 1
-
-
-def common_reference_point(name: str, records: Sequence[Record], given: ArrayLike | None) -> Array:
-    """Of all records of a task, (n_objectives,).
-
-    :raises ValueError: if they have several and none is given, or one of another length
-    """
-    points = sorted({tuple(record.reference_point.tolist()) for record in records})
-    if given is None and len(points) > 1:
-        raise ValueError(
-            f"The records of {name} have the reference points {points}: choose one with --reference-point, or leave the others "
-            "out."
-        )
-    reference = records[0].reference_point if given is None else np.asarray(given, dtype=np.float64)
-    for record in records:
-        if record.preferences.shape[1] != len(reference):
-            raise ValueError(
-                f"{name} has {record.preferences.shape[1]} objectives in {record.path}, the reference point "
-                f"{reference.tolist()} has {len(reference)} numbers: report tasks of other numbers of objectives apart."
-            )
-    return reference
 
 
 def _check_protocol(name: str, records: Sequence[Record]) -> None:

@@ -11,7 +11,6 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_momba import MOMBA
-from sb3_momba.benchmark.methods import method_settings
 from sb3_momba.envs.preferences import preference_grid
 from sb3_momba.explorer.kit import DecisionKit
 from sb3_momba.explorer.prediction import Calibration, calibrate, draw_calibration
@@ -19,6 +18,7 @@ from sb3_momba.explorer.reading import Run, read_run
 from sb3_momba.explorer.rendering import RenderingProcess, check_filmable
 from sb3_momba.explorer.rollouts import roll_out
 from sb3_momba.explorer.stage import RenderingError
+from sb3_momba.methods import method_settings
 from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, probe_environment
 from sb3_momba.pareto.protocol import N_EPISODES
 from sb3_momba.records import Record

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_momba import __version__
-from sb3_momba.benchmark.results import common_reference_point
 from sb3_momba.explorer import charts
 from sb3_momba.explorer.reading import Run, measure, objectives_of, read_runs
 from sb3_momba.explorer.rendering import FPS, Film, RenderingProcess, check_filmable, film
 from sb3_momba.explorer.stage import RenderingError
 from sb3_momba.files import atomic_write
+from sb3_momba.records import common_reference_point
 
 N_FILMS = 20
 

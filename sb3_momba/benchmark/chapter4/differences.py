@@ -8,10 +8,10 @@ from sb3_momba.baselines.schedules import script_of
 from sb3_momba.benchmark.chapter4.layout import FIXED, MAIN, Labels, Methods, all_labels
 from sb3_momba.benchmark.chapter4.scores import Tasks, runs_of, settings_of
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
-from sb3_momba.benchmark.methods import flat, setting_text
 from sb3_momba.benchmark.results import Run, Task
 from sb3_momba.benchmark.tables import markdown
 from sb3_momba.envs.registry import raw_id
+from sb3_momba.methods import flat, setting_text
 from sb3_momba.pareto import protocol
 from sb3_momba.recording import plain
 from sb3_momba.records import Record

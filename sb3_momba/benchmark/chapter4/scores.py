@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from sb3_momba.benchmark.chapter4.layout import MOMBA, NONE, PGMORL, Labels, Methods
 from sb3_momba.benchmark.chapter4.thesis import read_thesis
 from sb3_momba.benchmark.curves import Curve, curve_through
-from sb3_momba.benchmark.methods import method_settings, setting_text
 from sb3_momba.benchmark.results import Metric, Run, Task, compare, curve_on, is_fixed_preference, parameters_of
 from sb3_momba.benchmark.statistics import Estimate, estimate, interquartile_mean
 from sb3_momba.envs.registry import raw_id
+from sb3_momba.methods import method_settings, setting_text
 from sb3_momba.records import Record
 
 Array = NDArray[np.float64]
