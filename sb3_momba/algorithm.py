@@ -171,7 +171,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             sampler = make_sampler(self.preference_sampler, self.n_objectives)
             env.env_method("set_preference_sampler", CloudpickleWrapper(sampler))
         if self.n_objectives == 1:
-            logger.info(
+            logger.warning(
                 "The environment has one objective: MOMBA trains it as single-objective SAC, with %s.",
                 self.policy_class.__name__,
             )

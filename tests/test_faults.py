@@ -66,7 +66,7 @@ def assert_fails_after(env: Any, n_stored: int, match: str) -> None:
 
 
 def test_row_01_a_scalar_reward_without_reward_space_trains_as_one_objective_and_says_so_once(caplog):
-    with caplog.at_level(logging.INFO, logger="sb3_momba"):
+    with caplog.at_level(logging.WARNING, logger="sb3_momba"):
         model = tiny_model("Pendulum-v1", learning_starts=5).learn(20)
     assert [record.message for record in caplog.records if "one objective" in record.message] == [
         "The environment has one objective: MOMBA trains it as single-objective SAC, with SimbaPolicy."

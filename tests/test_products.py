@@ -117,7 +117,7 @@ def test_auto_takes_bfloat16_where_the_processor_has_it_and_says_where_not(monke
     for native, dtype in ((True, th.bfloat16), (False, th.float32)):
         products.product_dtype.cache_clear()
         monkeypatch.setattr(products, "has_native_bfloat16", lambda device, native=native: native)
-        with caplog.at_level("INFO"):
+        with caplog.at_level("WARNING"):
             assert products.product_dtype("auto", cpu) == dtype
         assert products.product_dtype("float32", cpu) == th.float32
         assert products.product_dtype("bfloat16", cpu) == th.bfloat16

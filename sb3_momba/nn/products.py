@@ -24,7 +24,7 @@ def product_dtype(precision: str, device: th.device) -> th.dtype:
     if precision == "auto":
         native = has_native_bfloat16(device)
         if not native:
-            logger.info("precision='auto': %s has no bfloat16 of its own, float32 is used.", device)
+            logger.warning("precision='auto': %s has no bfloat16 of its own, float32 is used.", device)
         return th.bfloat16 if native else th.float32
     return th.bfloat16 if precision == "bfloat16" else th.float32
 
