@@ -255,7 +255,9 @@ class MOMBA(PreferenceConditionedAlgorithm):
         descend(self.actor.optimizer, actor_loss, "actor")
         follow_batch_statistics(self.actor)
         if self.ent_coef_optimizer is not None:
-            descend(self.ent_coef_optimizer, self._alpha_loss(log_prob), "entropy coefficient")
+            alpha_loss = self._alpha_loss(log_prob)
+            descend(self.ent_coef_optimizer, alpha_loss, "entropy coefficient")
+            metrics["ent_coef_loss"] = alpha_loss.detach()
         return metrics
 
     def _rounded_products(self) -> contextlib.AbstractContextManager[None]:

@@ -368,6 +368,7 @@ ALWAYS_LOGGED = {
     "train/actor_loss",
     "train/entropy",
     "train/ent_coef",
+    "train/ent_coef_loss",
     "train/return_scale",
     "train/target_end_mass",
     "train/feature_norm",
