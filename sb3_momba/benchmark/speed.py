@@ -38,6 +38,7 @@ SCALING: dict[str, list[dict[str, Any]]] = {
 }
 LOOPS: list[dict[str, Any]] = [
     {},
+    {"compile": True},
     {"precision": "bfloat16"},
     {"precision": "bfloat16", "compile": True},
     *({"gradient_steps": n} for n in (2, 4, 8)),
@@ -166,6 +167,8 @@ def loop_table(updates: int = 320) -> str:
     """Environment steps per second of `learn`, updates included, and the share of what is not an update."""
     rows = [["setting", "env steps/s", "updates/s", "not in updates"]]
     for settings in LOOPS:
+        if settings.get("compile") and not has_compiler():
+            continue
         n_envs = settings.get("n_envs", 1)
         env = make_mo_vec_env(TASK, n_envs)
         others = {name: value for name, value in settings.items() if name != "n_envs"}
