@@ -268,10 +268,10 @@ def test_table_4_3_by_hand(fake) -> None:
     values = np.array(FRONT) * 1_000
     made = [fake("momba", values), fake("momba", None, error=BAD, seed=1), fake("pgmorl", values, general_policy=False)]
     rows = {tuple(row[:3]): row[3:] for row in cells_of(table_4_3(tasks_of(made)))}
-    assert rows["environment", "metric", "of"] == list(layout.MAIN)
+    assert rows["environment", "metric", "of"] == [*layout.MAIN, "nothing learned"]
     # A hypervolume of 6e6 and one of 0; an expected utility of 8e3 / 3 and that of the worst floor, 0.5.
-    assert rows["Hopper-v4", "HV / 10^7", "records"] == ["0.3 [0, 0.6]", "**0.6**", *["missing"] * 3]
-    assert rows["Hopper-v4", "EUM / 10^3", "records"] == ["1.334 [0.0005, 2.667]", "**2.667**", *["missing"] * 3]
+    assert rows["Hopper-v4", "HV / 10^7", "records"] == ["0.3 [0, 0.6]", "**0.6**", *["missing"] * 3, "1e-07"]
+    assert rows["Hopper-v4", "EUM / 10^3", "records"] == ["1.334 [0.0005, 2.667]", "**2.667**", *["missing"] * 3, "0.001"]
     assert rows["Hopper-v4", "HV / 10^7", "thesis"][:2] == ["**1.81 [1.78, 1.85]**", "1.53 [1.4, 1.64]"]
     assert rows["Ant-v4", "HV / 10^6", "records"] == ["missing"] * 5
     assert rows["Swimmer-v4", "EUM / 10^2", "thesis"][1].startswith("**1.27")

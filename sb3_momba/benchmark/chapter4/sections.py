@@ -63,7 +63,10 @@ def figure_4_1(tasks: Tasks, folder: Path) -> str:
 
 
 def table_4_3(tasks: Tasks, folder: Path) -> str:
-    caution = "Whether the thesis trained on exactly these models of the tasks is not known. The best of a row is bold.\n"
+    caution = (
+        "Whether the thesis trained on exactly these models of the tasks is not known. The best of a row is bold; its last "
+        "number is that of the better of two policies that learned nothing, standing still and random actions.\n"
+    )
     return "\n".join([caution, tables.table_4_3(tasks), notes(tasks, layout.MAIN)])
 
 

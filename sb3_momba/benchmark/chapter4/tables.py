@@ -64,16 +64,19 @@ def n_policies(run: Run) -> int | None:
 
 
 def table_4_3(tasks: Tasks) -> str:
-    """Results per task, in the units of the thesis's table."""
-    rows = [["environment", "metric", "of", *MAIN]]
+    """Results per task, in the units of the thesis's table, beside the better of the policies that learned nothing."""
+    rows = [["environment", "metric", "of", *MAIN, "nothing learned"]]
     for env, published in read_thesis().tasks.items():
+        floors = tasks[env].floors.values() if env in tasks else ()
+        best_floors = dict(zip(SHORT, np.max([floor[:2] for floor in floors], axis=0), strict=True)) if floors else {}
         for metric, short in SHORT.items():
             unit = published.units[metric]
             ours = [score_of(runs_of(tasks.get(env), labels), metric) for labels in MAIN.values()]
             theirs = [published.scores[metric][title] for title in MAIN]
             unit_text = f"{short} / 10^{round(np.log10(unit))}"
-            for of, scores in (("records", ours), ("thesis", theirs)):
-                rows.append([published.name, unit_text, of, *with_best_in_bold(scores, 1 / unit)])
+            floor = f"{best_floors[metric] / unit:,.4g}" if best_floors else ""
+            for of, scores, beside in (("records", ours, floor), ("thesis", theirs, "")):
+                rows.append([published.name, unit_text, of, *with_best_in_bold(scores, 1 / unit), beside])
     return markdown(rows)
 
 
