@@ -61,6 +61,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     compile: bool
     log_ent_coef: th.Tensor | None
     _root_callback: BaseCallback | None = None
+    _in_a_step = False  # from its action until it is stored
     _states_of_callbacks: dict[str, Any] | None = None  # from a checkpoint, for the callbacks of the next `learn`
     _resumed_from: tuple[Checkpoint, PreferenceReplayBuffer] | None = None  # and the buffer that it filled
 
@@ -226,6 +227,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     ) -> tuple[np.ndarray, np.ndarray]:
         """The action for the environments and, scaled to [-1, 1], for the replay buffer; SB3's unless CAPQL's, TD3's or noise
         that is kept is asked for."""
+        self._in_a_step = True
         explores_by_the_mean = self.deterministic_exploration or self.td3_noise is not None
         if self.num_timesteps < learning_starts or not (explores_by_the_mean or self.noise_repeat > 1):
             return super()._sample_action(learning_starts, action_noise, n_envs)
@@ -258,6 +260,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         self.policy.observe_rewards(self.replay_buffer.latest_rewards, dones)
         if self.preference_alignment and self.preference_alignment != "positive":
             self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
+        self._in_a_step = False
 
     def _setup_learn(
         self,
@@ -269,8 +272,11 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
     ) -> tuple[int, BaseCallback]:
         """SB3's; where it resets the environments, the episodes that were going on end here.
 
-        SB3 resets the action noise at every `learn`: after a checkpoint it goes on from where it was instead.
+        SB3 resets the action noise at every `learn`: after a checkpoint it goes on from where it was instead. A callback or an
+        error that ended the last `learn` within a step left the environments elsewhere than at `_last_obs`: they are reset.
         """
+        if self._in_a_step:
+            self._last_obs, self._in_a_step = None, False
         noise = self.action_noise
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:  # those of another VecEnv
             self.action_noise = noise.base_noise

@@ -202,7 +202,7 @@ class PickleFreeSaving(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor"]
-        of_the_training = ["_metrics", "_negative_returns", "_held_noise"]
+        of_the_training = ["_metrics", "_negative_returns", "_held_noise", "_in_a_step"]
         of_the_process = ["_root_callback", "_states_of_callbacks", "_resumed_from"]
         return [*super()._excluded_save_params(), *derived, *of_the_training, *of_the_process]
 

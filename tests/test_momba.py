@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
@@ -248,6 +248,48 @@ def test_learn_goes_on_or_starts_over():
     assert model.replay_buffer.pos == 40
     assert model.learn(10).num_timesteps == 10
     assert model._n_updates == 10 + 10
+
+
+@pytest.mark.parametrize("stopped_at", [4, 10, 11])  # within an episode, at its end, at the next one's start
+@pytest.mark.parametrize("n_objectives", [1, 2])
+def test_after_a_stop_within_a_step_learning_goes_on_with_a_reset(n_objectives, stopped_at):
+    """The step at which a callback stopped was made, but not stored: its transition is missing, and no other is false."""
+
+    def until(steps):
+        return lambda local, _: local["self"].num_timesteps < steps
+
+    model = tiny_model(StubEnv(n_objectives, episode_length=10), learning_starts=100).learn(50, callback=until(stopped_at))
+    model.learn(25, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    n = buffer.pos
+    assert n == stopped_at - 1 + 25
+    steps = np.floor(buffer.next_observations[:n, 0, 0])
+    assert steps.tolist() == [*range(1, stopped_at), *range(stopped_at + 1, stopped_at + 26)]
+    np.testing.assert_array_equal(buffer.rewards[:n, 0, 0], steps)
+    np.testing.assert_array_equal(np.floor(buffer.observations[:n, 0, 0]), steps - 1)
+    assert buffer.dones[stopped_at - 2, 0] == 1
+    returns, largest = np.zeros(n_objectives), 0.0
+    for reward, done in zip(buffer.rewards[:n, 0], buffer.dones[:n, 0], strict=True):
+        returns = 0.99 * returns + reward
+        largest = max(largest, float(np.abs(returns).max()))
+        returns *= 1 - done
+    assert float(model.policy.return_scale.max_return) == pytest.approx(largest, rel=1e-5)
+
+
+def test_after_an_error_within_a_step_learning_goes_on_with_a_reset():
+    class Failing(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 4:
+                raise ArithmeticError
+            return True
+
+    env = StubEnv(episode_length=10)
+    model = tiny_model(env, learning_starts=100)
+    with pytest.raises(ArithmeticError):
+        model.learn(20, Failing())
+    model.learn(3, reset_num_timesteps=False)
+    np.testing.assert_array_equal(model.replay_buffer.dones[:6, 0], [0, 0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(np.floor(model.replay_buffer.observations[:6, 0, 0]), [0, 1, 2, 4, 5, 6])
 
 
 def test_a_new_learn_ends_the_episodes_that_its_reset_cuts_off():
