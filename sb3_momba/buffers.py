@@ -97,7 +97,8 @@ class PreferenceReplayBuffer(ReplayBuffer):
         raw_space = spaces.Box(observation_space.low[:raw_dim], observation_space.high[:raw_dim], dtype=np.float32)
         super().__init__(buffer_size, raw_space, action_space, device, n_envs)
         self.goes_on = True  # whether what comes next belongs to the same episodes as the newest row
-        self.n_added = 0  # rows since the training began, those overwritten among them
+        self.n_added = 0  # rows since the training began or the last `reset`, those overwritten among them
+        self.n_resets = 0
         self.rewards = np.zeros((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.preferences = np.ones((self.buffer_size, n_envs, n_objectives), dtype=np.float32)
         self.gamma = gamma
@@ -111,6 +112,12 @@ class PreferenceReplayBuffer(ReplayBuffer):
     def seed(self, seed: int | None) -> None:
         """Start the buffer's random stream, which is not that of an environment with the same seed."""
         self.rng = np.random.default_rng(None if seed is None else [seed, 2])
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        self.goes_on, self.n_added = True, 0
+        self.n_resets += 1
 
     def check_memory(self) -> None:
         """

@@ -304,6 +304,17 @@ def test_a_segment_that_is_gone_is_written_again(tmp_path):
     assert_same_tree(everything(resumed), everything(model))
 
 
+@pytest.mark.parametrize("after", [5, 70])  # fewer transitions than before, and more than the buffer holds
+def test_a_buffer_that_was_emptied_is_written_anew(tmp_path, after):
+    callback = MombaCheckpointCallback(20, tmp_path)
+    model = new_model(StubEnv()).learn(45, callback)
+    model.replay_buffer.reset()
+    assert model.replay_buffer.size() == len(model.replay_buffer.newest_returns()) == 0
+    model.learn(after, callback, reset_num_timesteps=False)
+    resumed = MOMBA.resume(tmp_path, stub_at(checkpoints_in(tmp_path)[0]))
+    assert_same_tree(everything(resumed)["buffer"], everything(model)["buffer"])
+
+
 def test_files_of_others_are_left_alone(tmp_path):
     (tmp_path / "shared" / "folder").mkdir(parents=True)
     (tmp_path / "shared" / "thesis.npz").touch()

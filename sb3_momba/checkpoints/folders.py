@@ -146,6 +146,7 @@ class CheckpointWriter:
         self.root = Path(root)
         self.keep = keep
         self.checksums: dict[str, dict[str, Any]] = {}  # of the shared files, in the order in which they were written
+        self.n_resets = 0  # of the replay buffer whose transitions they hold
 
     @property
     def shared_folder(self) -> Path:

@@ -26,7 +26,7 @@ def rows_of(name: str) -> tuple[int, int]:
 
 
 def write_segments(buffer: PreferenceReplayBuffer, writer: CheckpointWriter) -> tuple[list[str], dict[str, Any]]:
-    """Write what no segment holds yet; all of it where one of them is gone.
+    """Write what no segment holds yet; all of it where one of them is gone, or the buffer was emptied since.
 
     The newest row is no part of them: it still changes where its episode is ended from outside.
 
@@ -34,8 +34,8 @@ def write_segments(buffer: PreferenceReplayBuffer, writer: CheckpointWriter) -> 
     """
     oldest, last = buffer.n_added - buffer.size(), max(buffer.n_added - 1, 0)
     names = [name for name in writer.checksums if rows_of(name)[1] > oldest]
-    if any(map(writer.lacks, names)):
-        writer.checksums, names = {}, []
+    if buffer.n_resets != writer.n_resets or any(map(writer.lacks, names)):
+        writer.checksums, writer.n_resets, names = {}, buffer.n_resets, []
     first = max(rows_of(names[-1])[1] if names else 0, oldest)
     if first < last:
         names.append(segment_name(first, last))
