@@ -107,6 +107,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
         self.concentration = concentration
         self.n_relabels = n_relabels
         self.corner_probability = corner_probability
+        self._returns = self._corners = np.zeros((0, n_objectives))
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -310,10 +311,18 @@ class PreferenceReplayBuffer(ReplayBuffer):
         total = relabelled.sum(axis=1, keepdims=True)
         relabelled = np.where(total == 0, preferences, relabelled / np.where(total == 0, 1, total))
         keep = (self.rng.random(len(preferences)) < self.keep_probability)[:, None]
-        if self.corner_probability > 0 and len(returns := self.newest_returns()) > 0:
-            corners = self.rng.choice(corner_weights(returns), len(preferences))
+        if self.corner_probability > 0 and len(weights := self._corner_weights()) > 0:
+            corners = self.rng.choice(weights, len(preferences))
             relabelled = np.where(self.rng.random((len(preferences), 1)) < self.corner_probability, corners, relabelled)
         return np.where(keep, preferences, relabelled).astype(np.float32)
+
+    def _corner_weights(self) -> np.ndarray:
+        """Of the newest returns, (n, n_objectives); computed only when these have changed, as it takes up to a second."""
+        returns = self.newest_returns()
+        if not np.array_equal(returns, self._returns):
+            self._returns = returns
+            self._corners = corner_weights(returns) if len(returns) > 0 else returns
+        return self._corners
 
     def newest_returns(self) -> np.ndarray:
         """Undiscounted vector returns of the newest episodes, (n_episodes, n_objectives): at most 100 that ended within the

@@ -31,6 +31,8 @@ CHOICES = {
 HER_DEFAULTS = {"keep_probability": 0.2, "concentration": 5.0, "n_relabels": 1, "corner_probability": 0.0}
 BUFFER_ARGUMENTS = ("n_steps", "gamma", *HER_DEFAULTS, "seed", "handle_timeout_termination")
 
+MOST_OBJECTIVES_WITH_CORNERS = 6  # which take half a second to compute; with seven it is five seconds
+
 POLICY_SWITCHES = ("normalize_observations", "normalize_features", "normalize_weights", "capql_log_prob", "ortho_init")
 POLICY_SIZES = ("actor_hidden_dim", "actor_blocks", "critic_hidden_dim", "critic_blocks", "n_critics")
 # Arguments that the policy is told, and what follows from others.
@@ -173,10 +175,10 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
     if buffer_class is PreferenceReplayBuffer:
         check_names("replay_buffer_kwargs", settings["replay_buffer_kwargs"], BUFFER_ARGUMENTS)
         relabelling = {**(HER_DEFAULTS if model.her else {}), **(model.her_kwargs or {}), **settings["replay_buffer_kwargs"]}
-        _check_relabels(relabelling, model.batch_size)
+        _check_relabels(relabelling, model.batch_size, model.n_objectives)
 
 
-def _check_relabels(relabelling: Mapping[str, Any], batch_size: int) -> None:
+def _check_relabels(relabelling: Mapping[str, Any], batch_size: int, n_objectives: int) -> None:
     """:param relabelling: what the buffer is given"""
     n = relabelling.get("n_relabels", 1)
     check_whole("n_relabels", n, 1)
@@ -186,6 +188,11 @@ def _check_relabels(relabelling: Mapping[str, Any], batch_size: int) -> None:
         value = relabelling.get(name, nothing)
         if value != nothing and relabelling.get("keep_probability", 1) == 1:
             raise ValueError(f"{name}={value}, where no preference is relabelled: set her=True, and keep_probability below 1.")
+    if relabelling.get("corner_probability", 0.0) > 0 and n_objectives > MOST_OBJECTIVES_WITH_CORNERS:
+        raise ValueError(
+            f"corner_probability={relabelling['corner_probability']} with {n_objectives} objectives: a front has too many "
+            f"corner weights to compute beyond {MOST_OBJECTIVES_WITH_CORNERS}: set it to 0."
+        )
 
 
 def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:

@@ -338,6 +338,26 @@ def test_relabelling_toward_corner_weights():
         assert np.isclose(drawn, corner, atol=1e-6).mean() == pytest.approx(1 / 8, abs=0.03)
 
 
+def test_corner_weights_are_computed_once_for_the_same_returns(monkeypatch):
+    calls = []
+    monkeypatch.setattr("sb3_momba.buffers.corner_weights", lambda values: calls.append(len(values)) or corner_weights(values))
+    model = tiny_model(
+        StubEnv(episode_length=5), her=True, her_kwargs={"keep_probability": 0.0, "corner_probability": 0.5}, learning_starts=10
+    )
+    model.learn(24)
+    assert calls == [1, 2, 3]
+    model.replay_buffer.end_episodes()
+    model.replay_buffer.sample(8)
+    assert calls == [1, 2, 3, 4]
+
+
+def test_corner_weights_of_many_objectives_are_refused():
+    kwargs = {"her": True, "her_kwargs": {"corner_probability": 0.5}}
+    tiny_model(StubEnv(6), **kwargs)
+    with pytest.raises(ValueError, match=r"corner_probability=0\.5 with 7 objectives.*beyond 6: set it to 0"):
+        tiny_model(StubEnv(7), **kwargs)
+
+
 def test_before_two_episodes_have_ended_there_are_no_corners():
     model = tiny_model(StubEnv(), her=True, her_kwargs={"corner_probability": 1.0}, learning_starts=100).learn(3)
     assert len(model.replay_buffer.newest_returns()) == 0
