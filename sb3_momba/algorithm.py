@@ -29,7 +29,6 @@ from sb3_momba.export import export_policy
 from sb3_momba.logs import forgive_full_disks
 from sb3_momba.nn.networks import Actor, Critic
 from sb3_momba.nn.speed import keep_freed_memory
-from sb3_momba.policy import MombaPolicy
 from sb3_momba.saving import PickleFreeSaving
 from sb3_momba.settings import HER_DEFAULTS, OF_THE_ALGORITHM, check_settings, is_number, parse_ent_coef, parse_target_entropy
 
@@ -41,7 +40,6 @@ logger = logging.getLogger(__name__)
 class PreferenceConditionedAlgorithm(PickleFreeSaving):
     """An off-policy algorithm whose policy reads [observation, preference]; a subclass has the arguments and the update."""
 
-    policy: MombaPolicy
     actor: Actor
     critic: Critic
     critic_target: Critic

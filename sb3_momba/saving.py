@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
@@ -38,6 +39,7 @@ Self = TypeVar("Self", bound="PickleFreeSaving")
 class PickleFreeSaving(OffPolicyAlgorithm):
     """`save`, `load` and the replay buffer's two, with SB3's signatures; loading executes nothing."""
 
+    policy: MombaPolicy
     n_objectives: int
     ent_coef: str | float
     ent_coef_optimizer: th.optim.Optimizer | None
@@ -177,6 +179,8 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     def load_replay_buffer(self, path: FilePath, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
         """Put the transitions of a file into a new replay buffer of the file's size.
 
+        A model that has seen no step yet takes its statistics from them: without, what it learns from would not be normalised.
+
         :param truncate_last_traj: the next `learn` ends the last trajectory where the file ends, as with its usual reset
         :raises ValueError: if they are of another environment
         """
@@ -199,6 +203,14 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         buffer.goes_on = not truncate_last_traj
         buffer.device = self.device
         self.replay_buffer = buffer
+        if self.policy.statistics.count == 0:
+            self._take_statistics_from(buffer)
+
+    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
+        """As if its transitions had been stored one after another (Algorithm 1)."""
+        for row in np.arange(buffer.n_added - buffer.size(), buffer.n_added) % buffer.buffer_size:
+            self.policy.statistics.update(buffer.observations[row])
+            self.policy.observe_rewards(buffer.rewards[row], buffer.dones[row])
 
     def _excluded_save_params(self) -> list[str]:
         derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor"]

@@ -830,6 +830,26 @@ def test_a_loaded_replay_buffer_holds_and_draws_the_same(n_envs, n_timesteps, tm
     assert theirs.pos == (ours.pos + 1) % 60
 
 
+@pytest.mark.parametrize("kwargs", [{}, {"reward_centering": True}, {"return_scaling": "deviation"}])
+def test_a_model_that_has_seen_nothing_takes_its_statistics_from_a_buffer(tmp_path, kwargs):
+    def statistics_of(model):
+        return {
+            name: x
+            for name, x in model.policy.state_dict().items()
+            if name.split(".")[0] not in ("actor", "critic", "critic_target")
+        }
+
+    collected = tiny_model(make_mo_vec_env(StubEnv, 2), **kwargs).learn(50)
+    collected.save_replay_buffer(tmp_path / "buffer")
+    fresh, other = (tiny_model(make_mo_vec_env(StubEnv, 2), **kwargs) for _ in range(2))
+    fresh.load_replay_buffer(tmp_path / "buffer")
+    assert_same_tree(statistics_of(fresh), statistics_of(collected))
+    other.learn(10)
+    before = {name: x.clone() for name, x in statistics_of(other).items()}
+    other.load_replay_buffer(tmp_path / "buffer")
+    assert_same_tree(statistics_of(other), before)
+
+
 def test_loading_a_buffer_ends_its_last_trajectory_as_truncated(tmp_path):
     model = tiny_model(make_mo_vec_env(partial(StubEnv, episode_length=5), 2)).learn(14)
     model.save_replay_buffer(tmp_path / "buffer")
