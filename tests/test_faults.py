@@ -32,7 +32,7 @@ from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_momba import MOMBA, PreferenceWrapper, files, make_mo_vec_env
+from sb3_momba import MOMBA, PreferenceWrapper, evaluate_front, files, make_mo_vec_env
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, check_preference
 from sb3_momba.files import FileFormatError, read_tree
 from sb3_momba.finite import all_finite
@@ -751,6 +751,17 @@ def test_row_25_a_buffer_larger_than_memory_is_an_error_in_gb(monkeypatch):
     with pytest.raises(MemoryError, match=r"=100,000,000 .*5\.6 GB; 1\.0 GB are free: choose buffer_size=14,285,714"):
         model.learn(1)
     assert model.num_timesteps == 0
+
+
+def test_whole_numbers_as_actions_are_refused():
+    with pytest.raises(ValueError, match=r"dtype int32.*Declare a float32 Box"):
+        tiny_model(StubEnv(action_space=spaces.Box(0, 10, (3,), np.int32)))
+
+
+def test_an_evaluation_does_not_take_frames_stacked_outside():
+    venv = VecFrameStack(DummyVecEnv([lambda: Monitor(StubEnv(None))]), 3)
+    with pytest.raises(ValueError, match=r"VecFrameStack does not see .* stack frames inside it"):
+        evaluate_front(tiny_model(venv), venv)
 
 
 @pytest.mark.parametrize("wrapper", [VecNormalize, lambda venv: VecFrameStack(venv, 2)])

@@ -45,6 +45,11 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         )
     if not isinstance(action_space, spaces.Box):
         raise UnsupportedSpaceError(f"The action space {action_space} is not supported: continuous actions, a Box, are needed.")
+    if action_space.dtype is None or action_space.dtype.kind != "f":
+        raise UnsupportedSpaceError(
+            f"The action space {action_space} has the dtype {action_space.dtype}: actions are continuous, and would be cut to "
+            "whole numbers. Declare a float32 Box, and round inside the environment or an ActionWrapper."
+        )
     if len(action_space.shape) != 1 or action_space.shape[0] == 0:
         raise UnsupportedSpaceError(
             f"The action space {action_space} has shape {action_space.shape}: flatten it to (n,) with an ActionWrapper."

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_momba.envs.making import check_vec_env, make_env, make_mo_vec_env, n_objectives_of, wrap_env
 from sb3_momba.envs.preferences import check_preference, preference_grid
@@ -307,6 +307,8 @@ def probe_environment(env: str | gym.Env | VecEnv | Callable[[], gym.Env], env_k
         check_vec_env(env)
         if is_vecenv_wrapped(env, VecNormalize):
             raise ValueError("VecNormalize scales rewards, which are no returns then: give the environment without it.")
+        if is_vecenv_wrapped(env, VecFrameStack):
+            raise ValueError("VecFrameStack does not see where an evaluation resets an environment: stack frames inside it.")
         spec = env.get_attr("spec", indices=[0])[0]
         deterministic = env.has_attr("deterministic") and all(env.get_attr("deterministic"))
         name = raw_id(spec.id) if spec is not None else "VecEnv"
