@@ -47,9 +47,8 @@ class RecordWriter:
 
     def resume(self, steps: int) -> "RecordWriter":
         """Go on with the record of a run that was cut off, from a checkpoint at `steps`."""
-        self.file = open(self.path, "r+b", buffering=0)  # noqa: SIM115
-        self.file.truncate(self.path.read_bytes().rfind(b"\n") + 1)  # A line that was cut off is none.
-        self.file.seek(0, os.SEEK_END)
+        os.truncate(self.path, self.path.read_bytes().rfind(b"\n") + 1)  # A line that was cut off is none.
+        self.file = open(self.path, "ab", buffering=0)  # noqa: SIM115
         try:
             self._write(_line("resumed", steps=steps, **_provenance()))
         except BaseException:

@@ -594,6 +594,44 @@ def test_a_disk_that_stays_full_leaves_whole_lines_without_an_end(tmp_path) -> N
     assert read_record(path).error == UNENDED
 
 
+@pytest.fixture
+def cut_off(tmp_path) -> Path:
+    """A record that was killed while it wrote a line."""
+    path = tmp_path / "record.jsonl"
+    with writer_of(path) as writer:
+        writer.append("evaluation", steps=1, seconds=0.0, values=VALUES)
+    path.write_bytes(path.read_bytes() + b'{"event": "evaluation", "steps": 2, "val')
+    return path
+
+
+def test_a_resumed_record_goes_on_after_its_last_whole_line(cut_off) -> None:
+    whole = cut_off.read_bytes()
+    whole = whole[: whole.rindex(b"\n") + 1]
+    with RecordWriter(cut_off).resume(1) as writer:
+        writer.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+    assert cut_off.read_bytes().startswith(whole)
+    assert [line["event"] for line in lines_of(cut_off)] == ["start", "evaluation", "resumed", "evaluation"]
+
+
+def test_a_full_disk_leaves_no_hole_in_a_resumed_record(cut_off) -> None:
+    with RecordWriter(cut_off).resume(1) as writer:
+        before = cut_off.read_bytes()
+        with pytest.raises(OSError, match="No space left"), room_for(40, cut_off):
+            writer.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+        assert cut_off.read_bytes() == before
+        writer.append("evaluation", steps=3, seconds=0.0, values=VALUES)
+    assert b"\0" not in cut_off.read_bytes()
+    assert [line["event"] for line in lines_of(cut_off)] == ["start", "evaluation", "resumed", "evaluation"]
+    assert [evaluation.steps for evaluation in read_record(cut_off).evaluations] == [1, 3]
+
+
+def test_a_full_disk_that_fails_a_resumed_run_leaves_its_end(cut_off) -> None:
+    with pytest.raises(OSError, match="No space left"), RecordWriter(cut_off).resume(1) as writer, room_for(40, cut_off):
+        writer.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+    assert [line["event"] for line in lines_of(cut_off)] == ["start", "evaluation", "resumed", "end"]
+    assert "No space left" in (read_record(cut_off).error or "")
+
+
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()], ids=repr)
 def test_a_line_that_does_not_reach_the_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch, error: BaseException) -> None:
     writer = writer_of(tmp_path / "record.jsonl")
