@@ -152,10 +152,16 @@ def _events(path: Path) -> Iterator[dict[str, Any]]:
         except ValueError as error:
             if number == len(lines) and number > 1:
                 return  # The last line was cut off while it was written.
-            raise FileFormatError(f"line {number} is no JSON: {str(error).rstrip('.')}.") from error
+            raise FileFormatError(f"line {number} is no JSON: {str(error).rstrip('.')}. {_without(path)}") from error
         if not isinstance(event, dict) or not isinstance(event.get("event"), str):
-            raise FileFormatError(f"line {number} has no event.")
+            raise FileFormatError(f"line {number} has no event. {_without(path)}")
         yield event
+
+
+def _without(path: Path) -> str:
+    """How to do without a damaged run: a report and a grid stop at it. Its folder may hold other records, by other names."""
+    what, place = ("folder", path.parent) if path.name == FILE_NAME else ("file", path)
+    return f"Move or delete this run's {what} to go on without it: {place}."
 
 
 def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:

@@ -839,6 +839,18 @@ def test_a_bad_line_in_the_middle_is_named(valid, line: bytes) -> None:
     assert "line 4" in refused(valid)
 
 
+@pytest.mark.parametrize("line", [b"\0" * 40, b"[1, 2]"], ids=["no JSON", "no event"])
+def test_a_bad_line_in_the_middle_is_named_with_its_cure(valid, tmp_path, line: bytes) -> None:
+    """A run has a folder of its own, whose record is record.jsonl; records that were put together in one have other names."""
+    lines = valid.read_bytes().split(b"\n")
+    valid.write_bytes(b"\n".join([*lines[:3], line, *lines[3:]]))
+    assert refused(valid).endswith(f"Move or delete this run's file to go on without it: {valid}.")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    record = valid.rename(folder / "record.jsonl")
+    assert refused(record).endswith(f"Move or delete this run's folder to go on without it: {folder}.")
+
+
 @pytest.mark.parametrize(
     ("version", "versions"),
     [(2, {"sb3_momba": "9.9"}), (0, {}), ("1", {}), (None, {}), ([1], {}), (2, "absent"), (2, None), (2, ["sb3_momba 9.9"])],
