@@ -136,7 +136,7 @@ def read_record(path: str | os.PathLike[str]) -> Record:
     if path.is_dir():
         raise FileFormatError(f"{path} is a folder, not a record.")
     try:
-        events = list(_events(path))
+        events = [event for _, event in whole_lines(path)]
         return _to_record(path, events)
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}") from error
@@ -144,18 +144,23 @@ def read_record(path: str | os.PathLike[str]) -> Record:
         raise FileFormatError(f"{path} is damaged, or no record: {type(error).__name__}: {str(error).rstrip('.')}.") from error
 
 
-def _events(path: Path) -> Iterator[dict[str, Any]]:
-    lines = path.read_bytes().removesuffix(b"\n").split(b"\n")
+def whole_lines(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """The lines of a record and what they hold, without a last one that was cut off while it was written.
+
+    :raises FileFormatError: for any other line that holds no event
+    """
+    with open(path, "rb") as file:
+        lines = file.readlines()
     for number, line in enumerate(lines, start=1):
         try:
             event = json.loads(line, parse_constant=refuse_constant)
         except ValueError as error:
             if number == len(lines) and number > 1:
-                return  # The last line was cut off while it was written.
+                return
             raise FileFormatError(f"line {number} is no JSON: {str(error).rstrip('.')}. {_without(path)}") from error
         if not isinstance(event, dict) or not isinstance(event.get("event"), str):
             raise FileFormatError(f"line {number} has no event. {_without(path)}")
-        yield event
+        yield line, event
 
 
 def _without(path: Path) -> str:

@@ -168,6 +168,13 @@ class TestFolders:
         np.testing.assert_array_equal(run.values, VALUES)
         assert "did not finish (ValueError: &lt;nan&gt;)" in to_html([run], np.zeros(2), "")
 
+    @pytest.mark.parametrize("more", ["\n", '{"event": "evalu', "\0\0\0\n"], ids=["an empty line", "a torn line", "NULs"])
+    def test_what_was_cut_off_after_the_end_is_ignored(self, tmp_path, more):
+        folder = write_run(tmp_path / "run", VALUES, PREFERENCES)
+        with open(folder / "record.jsonl", "a") as record:
+            record.write(more)
+        np.testing.assert_array_equal(read_run(folder).values, VALUES)
+
     def test_of_an_unfinished_run_the_best_model_is_filmed(self, tmp_path):
         for error, expected in ((None, "model.zip"), ("ValueError: it fell", "best_model.zip")):
             folder = write_run(tmp_path / expected, VALUES, PREFERENCES, error=error)

@@ -325,10 +325,19 @@ def test_a_single_objective_is_no_trade_off(tmp_path):
     fail(["live", tmp_path / "model.zip", "--env", "Pendulum-v1"], "has one objective")
 
 
-def test_a_damaged_final_front_is_named(run_folder, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("discounted_returns", [[1.0]], "do not go together"),
+        ("episode_lengths", [[10**30]], "OverflowError"),
+        ("settings", 7, "TypeError"),
+        ("settings", "gamma", "ValueError"),
+    ],
+)
+def test_a_damaged_final_front_is_named(run_folder, tmp_path, name, value, said):
     lines = (run_folder / "record.jsonl").read_text().splitlines()
     end = json.loads(lines[-1])
-    end["front"]["discounted_returns"] = [[1.0]]
+    end["front"][name] = value
     (tmp_path / "record.jsonl").write_text("\n".join([*lines[:-1], json.dumps(end)]) + "\n")
-    with pytest.raises(ValueError, match=r"record.jsonl: its final front .* do not go together"):
+    with pytest.raises(ValueError, match=rf"record.jsonl: its final front .*{said}"):
         read_run(tmp_path)

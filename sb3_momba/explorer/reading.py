@@ -1,7 +1,6 @@
 """What lies in the folder of a run, finished or not, as a report needs it."""
 
 import contextlib
-import json
 import logging
 from collections import Counter
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from sb3_momba.files import FileFormatError
 from sb3_momba.pareto.evaluation import ParetoFront
 from sb3_momba.pareto.metrics import non_dominated, regrets, summarise
 from sb3_momba.records import FILE_NAME as RECORD_NAME
-from sb3_momba.records import Record, is_cut_off_at_its_start, read_record
+from sb3_momba.records import Record, is_cut_off_at_its_start, read_record, whole_lines
 
 Array = NDArray[np.float64]
 
@@ -154,19 +153,21 @@ def final_front(record: Record) -> ParetoFront | None:
     """
     if record.error is not None or not record.general_policy:
         return None
-    front = json.loads(record.path.read_bytes().splitlines()[-1])["front"]
-    if "discounted_returns" not in front:
-        return None
     try:
+        *_, (_, end) = whole_lines(record.path)
+        front = end["front"]
+        if "discounted_returns" not in front:
+            return None
         preferences, returns, discounted = (
             np.asarray(front[name], dtype=np.float64) for name in ("preferences", "returns", "discounted_returns")
         )
         lengths = np.asarray(front["episode_lengths"], dtype=np.int64)
-    except (KeyError, TypeError, ValueError) as error:
+        settings = dict(front.get("settings", {}))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(f"{record.path}: its final front is damaged: {type(error).__name__}: {error}.") from error
     if discounted.shape != returns.shape or lengths.shape != returns.shape[:2] or preferences.shape != returns.shape[::2]:
         raise FileFormatError(f"{record.path}: its final front has arrays that do not go together.")
-    return ParetoFront(preferences, returns, discounted, lengths, dict(front.get("settings", {})))
+    return ParetoFront(preferences, returns, discounted, lengths, settings)
 
 
 def _front(folder: Path, values: Array) -> ParetoFront | None:
