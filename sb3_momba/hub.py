@@ -22,7 +22,7 @@ from sb3_momba.files import atomic_write
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.recording import plain
 from sb3_momba.records import FILE_NAME as RECORD_NAME
-from sb3_momba.records import Record, read_record
+from sb3_momba.records import Record, read_record, whole_lines
 from sb3_momba.saving import read_model
 from sb3_momba.system import library_versions
 from sb3_momba.train import command_of
@@ -133,8 +133,9 @@ def package(
     if isinstance(source, MOMBA):
         source.save(folder / MODEL_NAME)
     else:
-        for name in (MODEL_NAME, RECORD_NAME):
-            shutil.copyfile(source / name, folder / name)
+        shutil.copyfile(source / MODEL_NAME, folder / MODEL_NAME)
+        with atomic_write(folder / RECORD_NAME) as file:
+            file.write(without_failures(source / RECORD_NAME))
     front.save(folder / FRONT_NAME)
     with atomic_write(folder / CARD_NAME) as file:
         file.write(str(card).encode())
@@ -158,6 +159,12 @@ def finished_run(folder: Path) -> Record:
     if record.error is not None:
         raise ValueError(f"{folder} holds a run that has not finished ({record.error}): go on with it, or push its model.")
     return record
+
+
+def without_failures(path: Path) -> bytes:
+    """A finished record without the failures that it went on after: their tracebacks name folders of this computer."""
+    lines = whole_lines(path)
+    return b"".join(line for line, event in lines if event["event"] != "end" or event["status"] == "finished")
 
 
 # ------------------------------------------------------------------------------------------------------------ the card

@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from copy import deepcopy
@@ -241,6 +242,31 @@ def test_pushing_makes_the_repository_and_uploads_the_package(run_folder, offlin
 
 
 # --------------------------------------------------------------------------------------------------- what is not sent
+
+
+def test_failures_of_earlier_attempts_are_not_sent(run_folder, tmp_path):
+    """Their tracebacks name folders of the computer."""
+    source = shutil.copytree(run_folder, tmp_path / "run")
+    record = source / "record.jsonl"
+    *lines, end = record.read_bytes().splitlines(keepends=True)
+    record.write_bytes(b"".join(lines))
+    for _ in range(2):
+        with pytest.raises(RuntimeError), RecordWriter(record).resume(60):
+            raise RuntimeError(f"{source} is gone")
+    with RecordWriter(record).resume(60):
+        pass
+    record.write_bytes(record.read_bytes() + end + b'{"event": "end", "traceback": "/home')
+    assert str(source).encode() in record.read_bytes()
+    hub.package(source, tmp_path / "packed", REPO)
+    packed = tmp_path / "packed" / "record.jsonl"
+    for place in (source, Path(hub.__file__).parent, Path(__file__).parent, "/home", "Traceback"):
+        assert str(place).encode() not in packed.read_bytes(), place
+    assert packed.read_bytes().startswith(b"".join(lines))
+    ours, theirs = read_record(record), read_record(packed)
+    assert (theirs.error, len(theirs.resumed)) == (None, 3)
+    assert (theirs.resumed, theirs.start) == (ours.resumed, ours.start)
+    assert [evaluation.steps for evaluation in theirs.evaluations] == [evaluation.steps for evaluation in ours.evaluations]
+    np.testing.assert_array_equal(theirs.final_values, ours.final_values)
 
 
 def test_sources_that_are_not_whole_are_refused_before_anything_is_sent(run_folder, tmp_path, offline):
