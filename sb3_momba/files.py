@@ -73,9 +73,11 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     :raises OSError: naming `path`, which is left as it was
     """
-    path = Path(os.path.realpath(path))
+    given, path = Path(path), Path(os.path.realpath(path))
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory: give the name of a file.")
+    if given.exists() and not given.is_file():  # A pipe or a device such as /dev/null, which would become a file.
+        raise OSError(f"{given} is no regular file: give the name of one.")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(f"{path} is read-only: choose another name, or make it writable.")

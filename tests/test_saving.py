@@ -295,6 +295,17 @@ def test_until_the_new_file_is_whole_the_old_one_stands(tmp_path):
     assert os.listdir(path.parent) == ["file"]
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="The system has no pipes with names.")
+def test_a_pipe_as_target_is_an_error_and_stays_one(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for name in ("pipe", "link"):
+        with pytest.raises(OSError, match=f"{name} is no regular file: give the name of one"), atomic_write(tmp_path / name):
+            pass
+    assert (tmp_path / "pipe").is_fifo()
+    assert sorted(os.listdir(tmp_path)) == ["link", "pipe"]
+
+
 # ---------------------------------------------------------------------------------------------------- damaged files
 
 
