@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sb3_momba.files import qualified_name
-from sb3_momba.records import FORMAT, VERSION
+from sb3_momba.records import FORMAT, VERSION, whole_lines
 from sb3_momba.system import git_revision, library_versions, machine
 
 
@@ -47,7 +47,8 @@ class RecordWriter:
 
     def resume(self, steps: int) -> "RecordWriter":
         """Go on with the record of a run that was cut off, from a checkpoint at `steps`."""
-        os.truncate(self.path, self.path.read_bytes().rfind(b"\n") + 1)  # A line that was cut off is none.
+        whole = sum(len(line) for line, _ in whole_lines(self.path) if line.endswith(b"\n"))
+        os.truncate(self.path, whole)  # A line that was cut off is none.
         self.file = open(self.path, "ab", buffering=0)  # noqa: SIM115
         try:
             self._write(_line("resumed", steps=steps, **_provenance()))

@@ -613,6 +613,17 @@ def test_a_resumed_record_goes_on_after_its_last_whole_line(cut_off) -> None:
     assert [line["event"] for line in lines_of(cut_off)] == ["start", "evaluation", "resumed", "evaluation"]
 
 
+@pytest.mark.parametrize("torn", [b"\n", b"\0\0" + b'{"event": "end", "status": "failed", "error": "full"}\n'], ids=repr)
+def test_a_record_goes_on_without_a_last_line_that_its_reader_passes_over(cut_off, torn: bytes) -> None:
+    """Followed by another line it would be a damaged one in the middle."""
+    cut_off.write_bytes(cut_off.read_bytes() + torn)
+    assert read_record(cut_off).error == UNENDED
+    with RecordWriter(cut_off).resume(1) as writer:
+        writer.append("evaluation", steps=2, seconds=0.0, values=VALUES)
+    assert [line["event"] for line in lines_of(cut_off)] == ["start", "evaluation", "resumed", "evaluation"]
+    assert [evaluation.steps for evaluation in read_record(cut_off).evaluations] == [1, 2]
+
+
 def test_a_full_disk_leaves_no_hole_in_a_resumed_record(cut_off) -> None:
     with RecordWriter(cut_off).resume(1) as writer:
         before = cut_off.read_bytes()
