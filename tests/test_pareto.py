@@ -3,7 +3,9 @@
 import csv
 import io
 import random
+import time
 from functools import partial, reduce
+from itertools import product
 
 import gymnasium as gym
 import matplotlib.image
@@ -152,6 +154,27 @@ def test_the_hypervolume_moves_with_the_reference_point_and_scales_with_the_unit
     volume = hypervolume(points, reference)
     assert hypervolume(points + 5, reference + 5) == volume
     assert hypervolume(points * units, reference) == volume * units.prod()
+
+
+@pytest.mark.parametrize("units", [np.ones(10), 10.0 ** np.arange(-4, 6)], ids=["units alike", "units apart"])
+def test_the_hypervolume_of_many_objectives_is_approximated_as_the_exact_one_never_ends(units):
+    """What products of five staircases dominate is the product of what each does, 6; as many values as preferences."""
+    staircase = [[3, 1], [2, 2], [1, 3]]
+    values = np.array([np.concatenate(steps) for steps in product(staircase, repeat=5)])
+    assert len(values) >= len(preference_grid(10))
+    reference = np.arange(10.0)
+    began = time.process_time()
+    volume = hypervolume((values + reference) * units, reference * units)
+    assert time.process_time() - began < 10
+    assert volume == pytest.approx(6**5 * units.prod(), rel=0.01)
+    assert hypervolume((values + reference) * units, reference * units) == volume
+
+
+@pytest.mark.parametrize("width", [6, 7, 10, 12])
+def test_the_hypervolume_of_boxes_along_the_axes(width):
+    """A cube of 1, and a box of height 1 on each side; exact up to six objectives."""
+    volume = hypervolume(np.ones((width, width)) + np.eye(width), np.zeros(width))
+    assert volume == pytest.approx(1 + width, rel=1e-12 if width <= 6 else 0.01)
 
 
 # ------------------------------------------------------------------------------------- utility, regret, distance, fronts

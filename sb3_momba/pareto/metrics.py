@@ -9,6 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+EXACT_UP_TO = 6  # objectives: with every one more, the exact hypervolume takes many times as long, and no signal ends it
+N_DIRECTIONS = 2**20  # of the approximation, which takes about a second
+
 
 def as_points(values: ArrayLike, name: str = "values", at_least: int = 0) -> Array:
     """Value vectors as a finite float64 (n, n_objectives) array of at least so many rows.
@@ -28,6 +31,9 @@ def as_points(values: ArrayLike, name: str = "values", at_least: int = 0) -> Arr
 def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
     """HV, eq. (4.1): the volume between the reference point and what the values dominate, in the product of their units.
 
+    Exact for up to six objectives. For more it is approximated, without random numbers: within 1 % for most sets of up to ten
+    objectives; several % off where each value lies barely above the reference point in some objective, or with more objectives.
+
     :param values: (n_solutions, n_objectives); none give 0
     :param reference_point: (n_objectives,); values that are not above it in every objective count for nothing
     :raises ValueError: for another shape, or an entry that is not finite
@@ -43,7 +49,11 @@ def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
         return 0.0
     if points.shape[1] == 1:
         return float(points.max() - reference[0])
-    return float(moocore.hypervolume(points, ref=reference, maximise=True))
+    if points.shape[1] <= EXACT_UP_TO:
+        return float(moocore.hypervolume(points, ref=reference, maximise=True))
+    heights = points - reference
+    span = heights.max(axis=0)  # Directions that are equally spaced see nothing of objectives with small units.
+    return float(moocore.hv_approx(heights / span, ref=0, maximise=True, nsamples=N_DIRECTIONS) * span.prod())
 
 
 def expected_utility(values: ArrayLike, preferences: ArrayLike) -> float:
