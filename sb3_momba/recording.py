@@ -45,13 +45,16 @@ class RecordWriter:
             raise
         return self
 
-    def resume(self, steps: int) -> "RecordWriter":
-        """Go on with the record of a run that was cut off, from a checkpoint at `steps`."""
+    def resume(self, steps: int, **content: Any) -> "RecordWriter":
+        """Go on with the record of a run that was cut off, from a checkpoint at `steps`.
+
+        :param content: of the line that says so, beside versions, machine, revision and time
+        """
         whole = sum(len(line) for line, _ in whole_lines(self.path) if line.endswith(b"\n"))
         os.truncate(self.path, whole)  # A line that was cut off is none.
         self.file = open(self.path, "ab", buffering=0)  # noqa: SIM115
         try:
-            self._write(_line("resumed", steps=steps, **_provenance()))
+            self._write(_line("resumed", steps=steps, **content, **_provenance()))
         except BaseException:
             self.file.close()
             raise

@@ -4,14 +4,15 @@ A record is JSON lines (UTF-8, strict JSON, one object a line). Every line has a
 
 - `start`, the first line: `format`, `version`, `label` (the method's name), `env`, `env_kwargs`, `seed`, `config` (every
   setting of the run, defaults included), `reference_point` (n_objectives,), `preferences` (P, n_objectives),
-  `general_policy`, `parameters` (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC).
+  `general_policy`, `parameters` (trainable ones of each network), `versions`, `machine`, `git_revision` and `started` (UTC);
+  and of a run that can be resumed `running`: how it is run, which no result depends on.
 - `floor`, one for each policy that learned nothing: `policy`, `values` (n, n_objectives) and the metrics.
 - `evaluation`, one for each point of the curve: `steps`, which rise, `seconds` (of training, without evaluations),
   `cpu_seconds` (the same, of processor time; not where environments have processes of their own), `evaluation_seconds` (so
   far), the metrics and `values` (n, n_objectives); and `extra_steps` of a method that plays episodes for itself which are not
   among its `steps`: how many steps they had so far.
 - `resumed`, where the run went on from a checkpoint: its `steps` (evaluations after them were made again, and the later ones
-  count), `versions`, `machine`, `git_revision` and `started`.
+  count), `running`, `versions`, `machine`, `git_revision` and `started`.
 - `end`, the last line: `status`. A "finished" run has its `steps`, perhaps `extra_steps`, and its final `front`: `returns` and
   `discounted_returns` (n, episodes, n_objectives), `episode_lengths` (n, episodes), the `preferences` that they answer, where
   they answer any, and its `settings`; one that "failed" has its `error` and, if it failed while it ran, the `traceback`.

@@ -35,8 +35,9 @@ from sb3_momba.settings import check_whole
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults, with_schedules
 
 CHECKPOINTS = "checkpoints"
-# No result depends on them.
-NOT_RECORDED = ("output", "progress_bar", "eval_workers", "checkpoint_freq", "keep_checkpoints")
+# No result depends on these: they are no settings of the method, and `config` is without them. A resumption takes over RUNNING.
+RUNNING = ("eval_workers", "checkpoint_freq", "keep_checkpoints")
+NOT_RECORDED = ("output", "progress_bar", *RUNNING)
 
 
 @dataclass
@@ -177,7 +178,8 @@ def run(settings: RunSettings, on_step: Callable[[int], None] | None = None) -> 
             "critic": sum(p.numel() for p in model.critic.parameters()),
         }
         config = recorded_settings(settings)
-        with ready.record.start(**description(settings, config, ready.preferences, ready.reference_point, sizes)) as record:
+        start = description(settings, config, ready.preferences, ready.reference_point, sizes)
+        with ready.record.start(**start, running=running_settings(settings)) as record:
             append_floors(record, evaluation.eval_env, ready.preferences, ready.reference_point, settings.n_episodes)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
             return _train(settings, ready, record, settings.steps, on_step)
@@ -205,7 +207,7 @@ def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running
     """Go on with a run that was cut off, from its newest checkpoint.
 
     :param on_step: see `run`
-    :param running: settings that no result depends on, such as eval_workers
+    :param running: settings that no result depends on, such as eval_workers, in place of those that it had last
     :raises ValueError: if there is nothing to go on with
     """
     path = folder / RECORD_NAME
@@ -219,8 +221,13 @@ def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running
             raise ValueError(
                 f"{folder} holds a run that was cut off before its first checkpoint: delete it, and start it again."
             )
+        for line in (*reversed(found.resumed), found.start):  # Of older versions they do not say how the run was run.
+            running = {**line.get("running", {}), **running}
         settings = RunSettings(**{**found.config, **running, "output": str(folder)})
-        with prepared(settings, resumed=True) as ready, ready.record.resume(ready.model.num_timesteps) as record:
+        with (
+            prepared(settings, resumed=True) as ready,
+            ready.record.resume(ready.model.num_timesteps, running=running_settings(settings)) as record,
+        ):
             name = f"progress_{ready.model.num_timesteps}.csv"  # The logs so far stay.
             outputs = [CSVOutputFormat(str(folder / name)), TensorBoardOutputFormat(str(folder))]
             ready.model.set_logger(Logger(str(folder), outputs))
@@ -319,3 +326,8 @@ def recorded_settings(settings: RunSettings) -> dict[str, Any]:
     config = {name: value for name, value in asdict(settings).items() if name not in NOT_RECORDED}
     config["hyperparameters"] = with_defaults(settings.policy, hyperparameters_of(settings))
     return dict(plain(config))
+
+
+def running_settings(settings: RunSettings) -> dict[str, int]:
+    """What a resumption takes over although no result depends on it."""
+    return {name: getattr(settings, name) for name in RUNNING}

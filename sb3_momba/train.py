@@ -20,7 +20,7 @@ import yaml
 from sb3_momba.envs.workers import WorkerError
 from sb3_momba.pareto import protocol
 from sb3_momba.recording import plain
-from sb3_momba.runs import RunResult, RunSettings, has_checkpoint, resume, run
+from sb3_momba.runs import RUNNING, RunResult, RunSettings, has_checkpoint, resume, run
 from sb3_momba.zoo.configuration import (
     N_TIMESTEPS,
     Configuration,
@@ -139,11 +139,9 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
         reference_point=given.reference_point,
         preference=given.preference,
         objectives=given.objectives,
-        eval_workers=given.eval_workers,
-        checkpoint_freq=given.checkpoint_freq,
-        keep_checkpoints=given.keep_checkpoints,
         device=given.device,
         progress_bar=given.progress_bar,
+        **running_options(arguments),
     )
 
 
@@ -240,11 +238,19 @@ def parse_resume(arguments: Sequence[str]) -> argparse.Namespace | None:
 
 
 def add_running_arguments(parser: argparse._ActionsContainer) -> None:
-    """Those that no result depends on."""
+    """Those that no result depends on. Without defaults, as these would win over what a resumed run had."""
     parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")
-    parser.add_argument("--eval-workers", type=int, default=1, help="processes that share an evaluation")
-    parser.add_argument("--checkpoint-freq", type=whole_number, default=10_000, help="environment steps between checkpoints")
-    parser.add_argument("--keep-checkpoints", type=int, default=2, help="how many stay")
+    parser.add_argument("--eval-workers", type=int, help="processes that share an evaluation")
+    parser.add_argument("--checkpoint-freq", type=whole_number, help="environment steps between checkpoints")
+    parser.add_argument("--keep-checkpoints", type=int, help="how many stay")
+
+
+def running_options(arguments: Sequence[str] | None = None) -> dict[str, Any]:
+    """Those of `RUNNING` that a command line gives, among any others."""
+    parser = argparse.ArgumentParser(allow_abbrev=False, add_help=False)
+    add_running_arguments(parser)
+    given, _ = parser.parse_known_args(arguments)
+    return {name: value for name in RUNNING if (value := getattr(given, name)) is not None}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -258,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             result = run(settings)
         else:
             folder = given.resume
-            result = resume(folder, **{name: value for name, value in vars(given).items() if name != "resume"})
+            result = resume(folder, progress_bar=given.progress_bar, **running_options(arguments))
     except (ValueError, MemoryError, ImportError, WorkerError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     except (KeyboardInterrupt, SystemExit) as ending:

@@ -1461,6 +1461,19 @@ def test_settings_that_no_result_depends_on_may_differ(training, tmp_path) -> No
     assert "eval_workers" not in read_record(tmp_path / cell.name / "record.jsonl").config
 
 
+def test_what_goes_on_is_told_how_to_run_from_now_on(training, tmp_path, monkeypatch) -> None:
+    """What the grid's options give; of the others the run's folder knows."""
+    training({0: "is cut off"})
+    run_grid(make_cells(["momba"], [ENV], 1, ["--keep-checkpoints", "6"]), tmp_path)
+    commands: list[list[str]] = []
+    monkeypatch.setattr(execution, "way_to_run", lambda *args: "go on")
+    put_in_place(monkeypatch, lambda command, log: commands.append(command[3:]) or 0)
+    folder = tmp_path / "momba" / ENV / "0"
+    for options in ([], ["--eval-workers", "2", "--n-preferences", "100"]):
+        run_grid(make_cells(["momba"], [ENV], 1, options), tmp_path)
+        assert commands.pop() == ["--resume", str(folder), "--no-progress-bar", *options[:2]]
+
+
 def test_what_has_to_run(tmp_path) -> None:
     (cell,) = make_cells(["momba"], [ENV], 1)
     settings = parsed(cell, tmp_path)

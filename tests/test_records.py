@@ -27,6 +27,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_momba import MOMBA, ParetoEvalCallback, ParetoFront, recording, system
+from sb3_momba.checkpoints.folders import checkpoints_in
 from sb3_momba.envs.making import make_mo_vec_env
 from sb3_momba.envs.preferences import ConeSampler, preference_grid
 from sb3_momba.files import FileFormatError
@@ -270,6 +271,54 @@ def test_a_run_goes_on_whose_record_has_names_in_place_of_classes(tmp_path) -> N
     record = read_record(tmp_path / "run" / "record.jsonl")
     assert record.error is None
     assert [evaluation.steps for evaluation in record.evaluations] == [60, 120]
+
+
+def test_a_resumption_keeps_how_the_run_was_run_unless_it_is_told_otherwise(tmp_path) -> None:
+    """How often checkpoints are written and how many stay, and the processes of an evaluation: no setting of the method."""
+
+    def cut(at: int, going: Callable[[Callable[[int], None]], Any]) -> None:
+        def stop(steps: int) -> None:
+            if steps == at:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            going(stop)
+
+    def checkpoints() -> list[int]:
+        return [int(path.name.partition("-")[2]) for path in checkpoints_in(folder / "checkpoints")]
+
+    folder = tmp_path / "run"
+    cut(45, partial(run, settings_of(folder, n_episodes=1, checkpoint_freq=10, keep_checkpoints=4, eval_workers=2)))
+    assert checkpoints() == [40, 30, 20, 10]
+    cut(75, partial(resume, folder, progress_bar=False))
+    assert checkpoints() == [70, 60, 50, 40]
+    cut(95, partial(resume, folder, progress_bar=False, keep_checkpoints=3, eval_workers=1))
+    assert checkpoints() == [90, 80, 70]
+    resume(folder, progress_bar=False)
+    assert checkpoints() == [120, 110, 100]
+    record = read_record(folder / "record.jsonl")
+    first = {"checkpoint_freq": 10, "keep_checkpoints": 4, "eval_workers": 2}
+    told = {"checkpoint_freq": 10, "keep_checkpoints": 3, "eval_workers": 1}
+    assert [line["running"] for line in (record.start, *record.resumed)] == [first, first, told, told]
+    assert not set(first) & set(record.config)
+
+
+def test_a_run_of_which_nothing_says_how_it_was_run_goes_on_with_the_defaults(tmp_path) -> None:
+    """Records of before have no such line."""
+
+    def cut(steps: int) -> None:
+        if steps == 70:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        run(settings_of(folder, n_episodes=1, checkpoint_freq=10, keep_checkpoints=4), cut)
+    path = folder / "record.jsonl"
+    start, *others = lines_of(path)
+    start.pop("running", None)
+    path.write_text("".join(json.dumps(line) + "\n" for line in (start, *others)))
+    resume(folder, progress_bar=False)
+    assert [path.name.partition("-")[2] for path in checkpoints_in(folder / "checkpoints")] == ["000000120", "000000060"]
 
 
 def test_parameters_are_the_trained_ones(tiny_run) -> None:

@@ -237,6 +237,16 @@ def test_a_full_disk_ends_a_trial_which_goes_on_from_its_checkpoint_when_asked(t
     assert '"resumed", "steps": 100' in (folder / "record.jsonl").read_text()
 
 
+def test_a_trial_that_goes_on_is_told_how_to_run_from_now_on(tmp_path, trial, monkeypatch) -> None:
+    told: list[dict[str, Any]] = []
+    monkeypatch.setattr(execution, "way_to_run", lambda *args: "go on")
+    monkeypatch.setattr(trials, "resume", lambda folder, on_step, **running: told.append(running))
+    with alone_in(tmp_path / "sweep"):
+        execution.log_of(tmp_path / "sweep" / RUNS[0]).parent.mkdir(parents=True)
+        trial()
+    assert told == [{"progress_bar": False, "checkpoint_freq": 100}]
+
+
 def test_what_cannot_begin_leaves_a_record_of_its_failure(tmp_path, trial, monkeypatch) -> None:
     def fails(*args: Any) -> None:
         raise MemoryError("too large")

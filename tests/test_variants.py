@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+from pathlib import Path
 from unittest.mock import Mock
 
 import mo_gymnasium
@@ -487,6 +488,19 @@ def test_a_signal_says_how_to_go_on(ending: BaseException, code: int, monkeypatc
             main(["--env", "mo-hopper-2obj-v5", "--output", str(tmp_path)])
         assert raised.value.code == code
         assert capsys.readouterr().err.strip() == message
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [("", {}), ("--checkpoint-freq 1e3 --keep-checkpoints 6", {"checkpoint_freq": 1_000, "keep_checkpoints": 6})],
+)
+def test_a_resumption_is_told_what_the_command_line_gives_and_no_defaults(monkeypatch, options: str, told: dict) -> None:
+    """Those would win over what the run's folder says."""
+    resume = Mock()
+    monkeypatch.setattr("sb3_momba.train.resume", resume)
+    monkeypatch.setattr("sb3_momba.train.report", str)
+    main(["--resume", "runs/hopper", "--no-progress-bar", *options.split()])
+    resume.assert_called_once_with(Path("runs/hopper"), progress_bar=False, **told)
 
 
 def test_a_command_line_needs_a_task_or_a_run(capsys) -> None:

@@ -19,7 +19,7 @@ from sb3_momba.benchmark import execution, grid
 from sb3_momba.benchmark.ending import end
 from sb3_momba.benchmark.grid import Cell
 from sb3_momba.files import FileFormatError, FolderInUseError
-from sb3_momba.train import INTERRUPTED
+from sb3_momba.train import INTERRUPTED, as_arguments, running_options
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +86,8 @@ def _run_cell(cell: Cell, settings: Any, retry_failed: bool, trainings: Training
         logger.info("%s is left alone: %s", cell.name, error)
         return str(error)
     if way is not None:
-        arguments = ["--resume", str(folder), "--no-progress-bar"] if way == "go on" else cell.arguments(folder)
+        resuming = ["--resume", str(folder), "--no-progress-bar", *as_arguments(running_options(cell.options))]
+        arguments = resuming if way == "go on" else cell.arguments(folder)
         command = [sys.executable, "-m", cell.program.module, *arguments]
         with open(execution.log_of(folder), "ab" if way == "go on" else "wb") as log:
             ended = trainings.run(command, log)

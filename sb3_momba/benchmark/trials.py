@@ -29,6 +29,7 @@ from sb3_momba.benchmark import execution
 from sb3_momba.benchmark.grid import Cell
 from sb3_momba.files import LOCK
 from sb3_momba.runs import resume
+from sb3_momba.train import running_options
 
 STATE = ".tune"  # Ray Tune's own files, in the output folder; nothing is read from them
 OBJECT_STORE_BYTES = 100_000_000  # trials exchange a few numbers
@@ -178,7 +179,7 @@ def train_cell(config: dict[str, Any]) -> None:
         ):
             try:
                 if way == "go on":
-                    resume(folder, Progress(), progress_bar=False)
+                    resume(folder, Progress(), progress_bar=False, **running_options(cell.options))
                 else:
                     cell.program.runs.run(settings, Progress())
             except Exception as error:
