@@ -257,6 +257,48 @@ def test_what_is_kept_acts_as_the_page_did(kit):
     assert kit.model.preference_sampler is None
 
 
+def test_what_is_kept_of_another_model_stays(kit, monkeypatch, tmp_path):
+    monkeypatch.setattr(kit, "folder", tmp_path)
+    w, first = kit.check([0.3, 0.7]), tmp_path / "0.3_0.7"
+    kit.keep(w)
+    choice = json.loads((first / "choice.json").read_text())
+    (first / "choice.json").write_text(json.dumps({**choice, "model": "/another/model.zip"}))
+    before = {path: path.read_bytes() for path in first.iterdir()}
+    (tmp_path / "0.3_0.7-2").mkdir()
+    (tmp_path / "0.3_0.7-2" / "choice.json").write_text("damaged")
+    for _ in range(2):  # Its own is written anew.
+        assert Path(kit.keep(w)["folder"]) == tmp_path / "0.3_0.7-3"
+    assert {path: path.read_bytes() for path in first.iterdir()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.3_0.7", "0.3_0.7-2", "0.3_0.7-3"]
+
+
+def test_nothing_is_kept_where_links_lead(kit, monkeypatch, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    precious = tmp_path / "precious.txt"
+    precious.write_text("mine")
+    monkeypatch.setattr(kit, "folder", tmp_path / "kept")
+    (kit.folder / "0.3_0.7-2").mkdir(parents=True)
+    (kit.folder / "0.3_0.7").symlink_to(tmp_path / "elsewhere")
+    (kit.folder / "0.3_0.7-2" / "model.zip").symlink_to(precious)
+    assert Path(kit.keep(kit.check([0.3, 0.7]))["folder"]) == kit.folder / "0.3_0.7-3"
+    assert not list((tmp_path / "elsewhere").iterdir())
+    assert precious.read_text() == "mine"
+
+
+def test_where_onnx_cannot_be_written_no_old_one_stays(kit, monkeypatch, tmp_path):
+    monkeypatch.setattr(kit, "folder", tmp_path)
+    w = kit.check([0.3, 0.7])
+    folder = Path(kit.keep(w)["folder"])
+
+    def export(*_):
+        raise ImportError("onnx is missing")
+
+    monkeypatch.setattr(MOMBA, "export", export)
+    kept = kit.keep(w)
+    assert (kept["files"], kept["notes"]) == (["model.zip", "choice.json"], ["onnx is missing"])
+    assert sorted(path.name for path in folder.iterdir()) == ["choice.json", "model.zip"]
+
+
 def test_a_model_alone_is_surveyed(vector_model, monkeypatch):
     with open_kit(vector_model, "MO-Hopper-v4", films=False) as kit:
         assert len(kit.front.preferences) == 41

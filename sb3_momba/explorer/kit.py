@@ -5,6 +5,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -260,10 +261,12 @@ class DecisionKit:
         """Write the policy with this preference built in: policy.onnx, which needs no preference, model.zip, whose preference
         sampler gives this one alone, and choice.json, which says what they are."""
         weights = [round(float(w), 6) for w in preference]
-        folder = self.folder / "_".join(f"{w:.4g}" for w in weights)
-        folder.mkdir(parents=True, exist_ok=True)
+        name = "_".join(f"{w:.4g}" for w in weights)
         files, notes = ["model.zip", "choice.json"], []
         with self._saving:
+            folders = (self.folder / (name if number == 1 else f"{name}-{number}") for number in count(1))
+            folder = next(filter(self._may_write_into, folders))
+            folder.mkdir(parents=True, exist_ok=True)
             before = self.model.preference_sampler
             try:
                 self.model.preference_sampler = preference.tolist()
@@ -274,6 +277,7 @@ class DecisionKit:
                 self.model.export(folder / "policy.onnx", preference)
                 files.insert(0, "policy.onnx")
             except ImportError as error:
+                (folder / "policy.onnx").unlink(missing_ok=True)  # An old one would be taken for that of model.zip.
                 notes.append(str(error))
             known = self._rollouts.get(preference.tobytes())
             choice = {
@@ -290,6 +294,18 @@ class DecisionKit:
             with atomic_write(folder / "choice.json") as file:
                 file.write(json.dumps(choice, indent=1, allow_nan=False).encode())
         return {"folder": str(folder.resolve()), "files": files, "notes": notes}
+
+    def _may_write_into(self, folder: Path) -> bool:
+        """Not where a policy of another model is kept, and not through links, which could lead to any file."""
+        choice = folder / "choice.json"
+        if any(path.is_symlink() for path in (folder, choice, folder / "model.zip", folder / "policy.onnx")):
+            return False
+        try:
+            return bool(json.loads(choice.read_bytes())["model"] == str(self.run.policy.path))
+        except FileNotFoundError:
+            return True
+        except (ValueError, KeyError, TypeError):
+            return False
 
 
 def finite(x: Array) -> list[Any]:
