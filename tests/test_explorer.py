@@ -22,7 +22,7 @@ from sb3_momba import MOMBA, ParetoFront, evaluate_front
 from sb3_momba.envs.registry import TASKS
 from sb3_momba.explorer import charts, report
 from sb3_momba.explorer.__main__ import main
-from sb3_momba.explorer.reading import read_run, read_runs
+from sb3_momba.explorer.reading import objectives_of, read_run, read_runs
 from sb3_momba.explorer.rendering import Policy, RenderingProcess, film, quieten, record_episode, stride_of
 from sb3_momba.explorer.report import add_films, fill, json_in_html, page_file, spread_out, to_html
 from sb3_momba.explorer.stage import RenderingError, Stage, backends, camera_on, follow
@@ -146,6 +146,17 @@ def test_the_page_names_nothing_that_is_not_in_it():
     for name in set(re.findall(r'at\("([\w-]+)"\)', script)):
         assert f'id="{name}"' in page, name
     assert not re.findall(r"https?://(?!www\.w3\.org/2000/svg)", script + page + page_file("page.css"))
+
+
+def test_names_of_objectives_import_nothing_that_a_record_names(tmp_path, monkeypatch):
+    (tmp_path / "of_others.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    run = read_run(write_run(tmp_path / "run", VALUES, PREFERENCES, env="of_others:MO-Hopper-v4"))
+    assert objectives_of(run.record) == ["Objective 1", "Objective 2"]
+    assert "of_others" not in sys.modules
+    for env in ("MO-Hopper-v4", "momba/MO-Hopper-v4"):
+        run = read_run(write_run(tmp_path / env, VALUES, PREFERENCES, env=env))
+        assert objectives_of(run.record) == ["forward speed", "jumping height"]
 
 
 class TestFolders:

@@ -185,10 +185,13 @@ def _front(folder: Path, values: Array) -> ParetoFront | None:
 
 
 def objectives_of(record: Record) -> list[str]:
-    """Their names: the run's own, those that the environment's class has, or numbers."""
+    """Their names: the run's own, those that the environment's class has, or numbers.
+
+    No environment "module:Id-v0" is made: the record of a stranger would import any module.
+    """
     n = record.preferences.shape[1]
     named = record.config.get("objectives")
-    if not named:
+    if not named and ":" not in record.env:
         with contextlib.suppress(Exception):  # An environment need not be installed where its runs are looked at.
             env = make_env(record.env, record.env_kwargs)
             named = env.get_wrapper_attr("objectives") if env.has_wrapper_attr("objectives") else None
