@@ -97,6 +97,17 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise
 
 
+def no_link(path: Path, option: str) -> Path:
+    """The path of what is written by default into a folder that may be a stranger's, where a link could lead to any file.
+
+    :param option: by which another path is given
+    :raises ValueError: if it is a link
+    """
+    if path.is_symlink():
+        raise ValueError(f"{path} is a symbolic link to {os.readlink(path)}: say where to write with {option}.")
+    return path
+
+
 def delete_unfinished(path: Path) -> None:
     """What processes that are gone had begun to write in the place of `path`."""
     for aside in path.parent.glob(f".{glob.escape(path.name)}.*.part"):

@@ -231,6 +231,26 @@ class TestFolders:
         assert run.values.shape == run.record.final_values.shape
 
 
+@pytest.mark.parametrize(
+    ("command", "name"), [("report", "report.html"), ("strobe", "strobe.png"), ("calibrate", "calibration.png")]
+)
+def test_no_output_goes_through_a_link_in_the_runs_folder(command, name, tiny_run, tmp_path):
+    folder, precious = tmp_path / "run", tmp_path / "precious.txt"
+    shutil.copytree(tiny_run, folder)
+    precious.write_text("mine")
+    (folder / name).symlink_to("../precious.txt")
+    fail([command, folder], rf"error: .*{name} is a symbolic link to \.\./precious\.txt: .* with --output")
+    assert precious.read_text() == "mine"
+
+
+def test_a_link_that_is_given_as_the_output_is_followed(tmp_path):
+    folder = write_run(tmp_path / "run", VALUES, PREFERENCES)
+    (tmp_path / "link.html").symlink_to("page.html")
+    main(["report", str(folder), "--output", str(tmp_path / "link.html")])
+    assert (tmp_path / "link.html").is_symlink()
+    assert (tmp_path / "page.html").stat().st_size > 1_000
+
+
 def test_the_command_says_what_is_wrong(tmp_path):
     with pytest.raises(SystemExit, match=r"error: .*is no run"):
         main(["report", str(tmp_path)])

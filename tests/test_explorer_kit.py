@@ -13,7 +13,9 @@ import pytest
 
 from sb3_momba import MOMBA
 from sb3_momba.envs.making import make_env
+from sb3_momba.explorer.__main__ import main
 from sb3_momba.explorer.kit import DecisionKit
+from sb3_momba.explorer.live import LiveServer
 from sb3_momba.explorer.opening import open_kit, write_calibration
 from sb3_momba.explorer.prediction import CRITIC, FRONT, predictors_of, share_close, sizes
 from sb3_momba.explorer.reading import final_front, read_run
@@ -283,6 +285,14 @@ def test_nothing_is_kept_where_links_lead(kit, monkeypatch, tmp_path):
     assert Path(kit.keep(kit.check([0.3, 0.7]))["folder"]) == kit.folder / "0.3_0.7-3"
     assert not list((tmp_path / "elsewhere").iterdir())
     assert precious.read_text() == "mine"
+
+
+def test_no_page_keeps_through_a_link_in_the_runs_folder(run_folder, tmp_path, monkeypatch):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    monkeypatch.setattr(LiveServer, "serve_forever", lambda self: None)
+    (folder / "kept").symlink_to(tmp_path)
+    fail(["live", folder, "--port", "0"], r"kept is a symbolic link to .*: .* with --keep")
+    main(["live", str(folder), "--port", "0", "--keep", str(folder / "kept")])
 
 
 def test_where_onnx_cannot_be_written_no_old_one_stays(kit, monkeypatch, tmp_path):

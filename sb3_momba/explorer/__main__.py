@@ -17,6 +17,7 @@ from sb3_momba.explorer.rendering import quieten
 from sb3_momba.explorer.report import write_report
 from sb3_momba.explorer.stage import RenderingError
 from sb3_momba.explorer.strobe import draw_strobe
+from sb3_momba.files import no_link
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -63,13 +64,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if given.command == "report":
             if given.films is not None and given.films < 0:
                 raise ValueError(f"--films {given.films}: give 0 or more.")
-            path = given.output or given.runs[0] / "report.html"
+            path = given.output or no_link(given.runs[0] / "report.html", "--output")
             write_report(given.runs, path, given.films, given.reference_point)
         elif given.command == "calibrate":
-            path = given.output or (given.model if given.model.is_dir() else given.model.parent) / "calibration.png"
+            folder = given.model if given.model.is_dir() else given.model.parent
+            path = given.output or no_link(folder / "calibration.png", "--output")
             write_calibration(given.model, given.env, given.preferences, path)
         else:
-            path = given.output or given.run / "strobe.png"
+            path = given.output or no_link(given.run / "strobe.png", "--output")
             draw_strobe(given.run, path, given.preferences, given.steps, given.poses)
         print(f"Written to {path} ({path.stat().st_size / 1e6:.1f} MB).")
     except (ValueError, OSError, ImportError, RenderingError, gym.error.Error) as error:

@@ -31,6 +31,7 @@ from sb3_momba.explorer.kit import DecisionKit, QuestionError
 from sb3_momba.explorer.opening import open_kit
 from sb3_momba.explorer.rendering import FPS
 from sb3_momba.explorer.report import fill, film_numbers, json_in_html, page_file, plotly_script
+from sb3_momba.files import no_link
 
 HOST, PORT, LAST_PORT = "127.0.0.1", 8765, 65_535
 LONGEST_REQUEST = 65_536  # bytes
@@ -298,6 +299,8 @@ def serve(
         logger.warning("Warning: --host %s lets everyone who reaches this machine roll out and keep policies.", host)
     th.set_num_threads(1)  # More of them only slow such small products down.
     with listen(host, port) as listening, open_kit(path, env, seeds, folder) as kit, LiveServer(kit, listening, host) as server:
+        if folder is None:
+            no_link(kit.folder, "--keep")
         logger.info("Open %s in a browser; Ctrl-C ends it.", server.url)
         server.serve_forever()
 
