@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -22,6 +22,7 @@ from sb3_momba import MOMBA, MombaCheckpointCallback, ParetoEvalCallback, Prefer
 from sb3_momba.buffers import STORED_ARRAYS
 from sb3_momba.checkpoints.folders import CheckpointWriter, checkpoints_in, newest, number_of
 from sb3_momba.checkpoints.replay_segments import rows_of
+from sb3_momba.checkpoints.training_state import set_states_of_callbacks, states_of_callbacks
 from sb3_momba.envs.preferences import PerStepSampler, UniformSampler
 from sb3_momba.files import FileFormatError, alone_in, read_tree
 from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv, assert_same_tree
@@ -265,6 +266,16 @@ class Counter(BaseCallback):
     def _on_step(self):
         self.steps.append(self.num_timesteps)
         return True
+
+
+def test_a_checkpoint_says_only_what_callbacks_remember():
+    callback = EvalCallback(StubEnv(), log_path="ours")
+    (place,) = states_of_callbacks(callback)
+    remembered = {"n_calls": 7, "log_path": "elsewhere", "best_model_save_path": "elsewhere", "_on_step": None}
+    set_states_of_callbacks(callback, {place: {"remembered": remembered, "own": None}})
+    assert callback.n_calls == 7
+    assert (callback.log_path, callback.best_model_save_path) == (str(Path("ours") / "evaluations"), None)
+    assert callable(callback._on_step)
 
 
 def test_a_callback_that_is_missing_is_said(tmp_path):

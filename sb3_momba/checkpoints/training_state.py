@@ -108,7 +108,8 @@ def set_states_of_callbacks(root: BaseCallback | None, states: dict[str, Any]) -
             if state["own"]:
                 warnings.warn(f"The checkpoint has the state of a callback {place}, which is not given now.", stacklevel=4)
             continue
-        for name, value in state["remembered"].items():
-            setattr(callback, name, value)
+        for name in REMEMBERED:  # A file of others could name more, such as where a callback writes.
+            if name in state["remembered"]:
+                setattr(callback, name, state["remembered"][name])
         if state["own"] is not None and hasattr(callback, "load_state_dict"):
             callback.load_state_dict(state["own"])
