@@ -3,12 +3,13 @@
 import gymnasium as gym
 import pytest
 import yaml
+from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_momba.envs.registry import preference_id
 from sb3_momba.runs import hyperparameters_of
 from sb3_momba.train import parse
-from sb3_momba.zoo.configuration import check_entry, find_entry, literal, read_configuration, with_schedules
+from sb3_momba.zoo.configuration import check_classes, check_entry, find_entry, literal, read_configuration, with_schedules
 from tests.stubs import StubEnv
 
 TASK = "mo-hopper-2obj-v5"
@@ -53,6 +54,52 @@ def test_one_preference_takes_the_place_of_a_configurations_sampler() -> None:
 def test_entries_that_cannot_be_are_named(entry: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_entry(entry)
+
+
+@pytest.mark.parametrize("key", ["callback", "env_wrapper", "vec_env_wrapper"])
+@pytest.mark.parametrize(
+    "named",
+    ["os.system", ["os.system"], {"os.system": {"command": "true"}}, [{"os.system": {"command": "true"}}]],
+    ids=["name", "list", "mapping", "list of mappings"],
+)
+def test_what_is_no_callback_or_wrapper_is_refused(key: str, named: object) -> None:
+    with pytest.raises(ValueError, match=f"{key}: 'os.system' is no subclass of "):
+        check_classes(check_entry({key: named}))
+
+
+@pytest.mark.parametrize(
+    ("key", "name"),
+    [
+        ("callback", "sb3_momba.pareto.callbacks.ParetoEvalCallback"),
+        ("callback", "stable_baselines3.common.callbacks.CheckpointCallback"),
+        ("env_wrapper", "gymnasium.wrappers.RescaleAction"),
+        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecCheckNan"),
+    ],
+)
+def test_classes_are_named_for_what_they_are(key: str, name: str) -> None:
+    others = {"callback": "gymnasium.Wrapper", "env_wrapper": "gymnasium.Env", "vec_env_wrapper": "gymnasium.Wrapper"}
+    check_classes(check_entry({key: [name, {name: {}}]}))
+    with pytest.raises(ValueError, match=f"{key}: '{others[key]}' is no subclass of "):
+        check_classes(check_entry({key: [name, others[key]]}))
+
+
+@pytest.mark.parametrize("name", ["sb3_momba.files.os.system", "sb3_momba.none.Nothing", "sb3_momba..files.x"])
+def test_classes_that_are_in_no_module_are_named(name: str) -> None:
+    with pytest.raises(ValueError, match=f"callback: '{name}' cannot be imported"):
+        check_classes({"callback": name})
+
+
+@pytest.mark.parametrize("name", ["sb3_momba.files.read_tree", "sb3_momba.files.os", "sb3_momba"])
+def test_what_is_no_class_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"callback: '{name}' is no subclass of BaseCallback"):
+        check_classes({"callback": name})
+
+
+def test_objects_of_a_file_of_python_are_as_they_are() -> None:
+    given = {"callback": [CheckpointCallback(1, "x")], "env_wrapper": [StubEnv, {StubEnv: {}}]}
+    entry = check_entry(given)
+    check_classes(entry)
+    assert {key: entry[key] for key in given} == given
 
 
 def test_what_only_rl_zoo3_can_do_is_an_error_elsewhere(tmp_path) -> None:

@@ -132,6 +132,24 @@ def test_unknown_names_are_errors(folder: Path) -> None:
     assert "Traceback" not in said
 
 
+def test_nothing_is_called_that_is_no_callback_or_wrapper(folder: Path) -> None:
+    for callback in ("subprocess.Popen", "rl_zoo3.utils.get_class_by_name"):
+        (folder / "shared.yml").write_text(yaml.dump({TASK: {**ENTRY, "callback": [{callback: {"args": "touch called"}}]}}))
+        code, said = zoo(folder, f"train --env {TASK} --conf shared.yml -f shared")
+        assert code == 1
+        assert said.splitlines()[-1].startswith(f"error: shared.yml, or -params: callback: '{callback}' is no subclass of")
+    assert not (folder / "called").exists()
+
+
+def test_objects_of_ones_own_come_from_a_file_of_python(folder: Path) -> None:
+    own = "class Own(BaseCallback):\n    def _on_step(self):\n        open('called', 'w').close()\n        return True\n"
+    entry = f"hyperparams = {{'momba/{TASK}': {{**{ {**ENTRY, 'n_timesteps': 120}!r}, 'callback': [Own()]}}}}\n"
+    (folder / "own.py").write_text("from stable_baselines3.common.callbacks import BaseCallback\n" + own + entry)
+    code, said = zoo(folder, f"train --env {TASK} --conf own.py -f own --eval-freq -1")
+    assert code == 0, said
+    assert (folder / "called").exists()
+
+
 @pytest.mark.parametrize("command", ["train", "enjoy", "optimize", "plot"])
 def test_without_rl_zoo3_the_command_that_installs_it_is_said(command: str, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)

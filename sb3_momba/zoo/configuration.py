@@ -1,16 +1,20 @@
-"""Reading hyperparameters from yaml in rl_zoo3's format. Values are literals: nothing is evaluated."""
+"""Reading hyperparameters from yaml in rl_zoo3's format. Values are literals: nothing is evaluated, and of what rl_zoo3
+imports and calls by its name, only callbacks and wrappers are let through."""
 
 import inspect
 import logging
 import re
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
-from importlib import resources
+from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_momba.envs.registry import PREFIX, raw_id
 from sb3_momba.momba import MOMBA
@@ -22,6 +26,7 @@ SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
 RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize", "env_kwargs", "callback")
 # What only rl_zoo3 can do; `callback` is left to it too, but changes no model.
 ZOO_KEYS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "monitor_kwargs", "noise_type", "noise_std")
+CALLED_BY_RL_ZOO3 = {"callback": BaseCallback, "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper}
 EVALUATED_BY_RL_ZOO3 = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "monitor_kwargs", "normalize")
 LINEAR = "lin_"
 WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d{1,3}")
@@ -122,6 +127,32 @@ def check_entry(entry: dict[str, Any]) -> dict[str, Any]:
     own = {key: value for key, value in entry.items() if key not in (*RUN_KEYS, *ZOO_KEYS)}
     check_hyperparameters(entry["policy"], own)
     return entry
+
+
+def named_classes(entry: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Each name of a class that rl_zoo3 would import and call, after its key."""
+    for key in CALLED_BY_RL_ZOO3:
+        given = entry.get(key)
+        for one in given if isinstance(given, list) else [given]:
+            for name in one if isinstance(one, dict) else [one]:
+                if isinstance(name, str):
+                    yield key, name
+
+
+def check_classes(entry: dict[str, Any]) -> None:
+    """That what a checked entry names is what rl_zoo3 takes it for. It is imported, which only rl_zoo3 needs.
+
+    :raises ValueError: for what is not there, or is no class of its kind
+    """
+    for key, name in named_classes(entry):
+        module, _, last = name.rpartition(".")
+        try:
+            found = getattr(import_module(module or name), last, None)
+        except ImportError as error:
+            raise ValueError(f"{key}: {name!r} cannot be imported: {error}") from error
+        base = CALLED_BY_RL_ZOO3[key]
+        if not (isinstance(found, type) and issubclass(found, base)):
+            raise ValueError(f"{key}: {name!r} is no subclass of {base.__name__}: give the full name of one.")
 
 
 def with_schedules(hyperparameters: dict[str, Any]) -> dict[str, Any]:

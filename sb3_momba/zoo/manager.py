@@ -14,7 +14,7 @@ from sb3_momba.envs.workers import WatchedSubprocVecEnv
 from sb3_momba.momba import MOMBA
 from sb3_momba.nn.descent import NonFiniteLossError
 from sb3_momba.pareto.callbacks import ParetoEvalCallback
-from sb3_momba.zoo.configuration import N_TIMESTEPS, check_entry, find_entry, with_schedules
+from sb3_momba.zoo.configuration import N_TIMESTEPS, check_classes, check_entry, find_entry, with_schedules
 from sb3_momba.zoo.evaluation import EvaluationsFile, TrialEvalCallback, ZooEvalCallback
 from sb3_momba.zoo.tuning import convert_params, sample_params
 
@@ -45,7 +45,7 @@ class MombaExperimentManager(exp_manager.ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """rl_zoo3's, checked and with numbers for numbers; entries may have the raw id.
 
-        :raises ValueError: for unknown names, with the nearest known one
+        :raises ValueError: for unknown names, with the nearest known one, and for classes that are no callbacks or wrappers
         """
         task = self.env_name
         if self.config.endswith((".yml", ".yaml")):
@@ -56,6 +56,7 @@ class MombaExperimentManager(exp_manager.ExperimentManager):
             self.env_name = task
         try:
             entry = check_entry(given)
+            check_classes(entry)
         except ValueError as error:
             raise ValueError(f"{self.config}, or -params: {error}") from error
         entry.setdefault("n_timesteps", N_TIMESTEPS)
