@@ -255,10 +255,22 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         observations = self._last_obs[:, : self.policy.observation_dim]
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.policy.statistics.update(observations)
-        self.policy.observe_rewards(self.replay_buffer.latest_rewards, dones)
-        if self.preference_alignment and self.preference_alignment != "positive":
-            self._negative_returns.add(self.replay_buffer.latest_rewards, dones)
+        self._observe_rewards(self.replay_buffer.latest_rewards, dones)
         self._in_a_step = False
+
+    def _observe_rewards(self, rewards: np.ndarray, dones: np.ndarray) -> None:
+        self.policy.observe_rewards(rewards, dones)
+        if self.preference_alignment and self.preference_alignment != "positive":
+            self._negative_returns.add(rewards, dones)
+
+    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
+        """As if its transitions had been stored one after another."""
+        rows = np.arange(buffer.n_added - buffer.size(), buffer.n_added) % buffer.buffer_size
+        for first in range(0, len(rows), 10_000):
+            observations = buffer.observations[rows[first : first + 10_000]]
+            self.policy.statistics.update(observations.reshape(-1, buffer.observation_dim))
+        for row in rows:
+            self._observe_rewards(buffer.rewards[row], buffer.dones[row])
 
     def _setup_learn(
         self,

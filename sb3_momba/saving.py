@@ -8,7 +8,6 @@ import zipfile
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
@@ -206,15 +205,9 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         if self.policy.statistics.count == 0:
             self._take_statistics_from(buffer)
 
-    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
-        """As if its transitions had been stored one after another (Algorithm 1)."""
-        for row in np.arange(buffer.n_added - buffer.size(), buffer.n_added) % buffer.buffer_size:
-            self.policy.statistics.update(buffer.observations[row])
-            self.policy.observe_rewards(buffer.rewards[row], buffer.dones[row])
-
     def _excluded_save_params(self) -> list[str]:
         derived = ["actor", "critic", "critic_target", "lr_schedule", "ent_coef_tensor"]
-        of_the_training = ["_metrics", "_negative_returns", "_held_noise", "_in_a_step"]
+        of_the_training = ["_metrics", "_negative_returns", "_held_noise"]
         of_the_process = ["_root_callback", "_states_of_callbacks", "_resumed_from"]
         return [*super()._excluded_save_params(), *derived, *of_the_training, *of_the_process]
 
@@ -224,6 +217,9 @@ class PickleFreeSaving(OffPolicyAlgorithm):
         return ["policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"], ["log_ent_coef"]
 
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:
+        raise NotImplementedError
+
+    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
         raise NotImplementedError
 
     def _check_buffer_fits(self, tree: dict[str, Any]) -> None:

@@ -54,7 +54,6 @@ class MombaCheckpointCallback(BaseCallback):
         self.path = Path(path).resolve()
         self.writer = CheckpointWriter(self.path, keep)
         self.buffer: PreferenceReplayBuffer | None = None  # whose rows the writer's segments hold
-        self.is_between_rollouts = True
         self.received: int | None = None
         self.received_at = -math.inf
         self.lock = contextlib.ExitStack()
@@ -99,7 +98,6 @@ class MombaCheckpointCallback(BaseCallback):
             signal.signal(*self.handlers.popitem())
 
     def _on_rollout_start(self) -> None:
-        self.is_between_rollouts = True
         # Only here have the last transition and the updates that follow it been made.
         if self.model.num_timesteps >= self.next_save or self.received is not None:
             self.next_save = (self.model.num_timesteps // self.save_freq + 1) * self.save_freq
@@ -114,11 +112,7 @@ class MombaCheckpointCallback(BaseCallback):
         raise SystemExit(128 + (number or 0))
 
     def _on_step(self) -> bool:
-        self.is_between_rollouts = False
         return True
-
-    def _on_rollout_end(self) -> None:
-        self.is_between_rollouts = True
 
     def after_learn(self) -> None:
         """However `learn` has ended: the signals and the folder are free again.
@@ -132,9 +126,10 @@ class MombaCheckpointCallback(BaseCallback):
             self._end()
 
     def _on_training_end(self) -> None:
-        if self.saved_at < self.model.num_timesteps and self.is_between_rollouts:
-            self.save()
-        elif not self.is_between_rollouts:
+        if not self.model._in_a_step:
+            if self.saved_at < self.model.num_timesteps:
+                self.save()
+        else:
             logger.warning(
                 "A callback has stopped the training in the middle of a step: the newest checkpoint is that at %d steps.",
                 self.saved_at,
