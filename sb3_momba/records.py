@@ -191,6 +191,8 @@ def _to_record(path: Path, events: list[dict[str, Any]]) -> Record:
     error: str | None = UNENDED
     traceback = ""
     extra_steps = 0
+    if not all(isinstance(event.get("running", {}), dict) for event in events):
+        raise FileFormatError("running is no mapping.")
     for event in events[1:]:
         extra_steps = _whole(event.get("extra_steps", extra_steps), "extra_steps")
         if event["event"] == "resumed" and final_values is None:

@@ -37,7 +37,7 @@ from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults, wi
 CHECKPOINTS = "checkpoints"
 # No result depends on these: they are no settings of the method, and `config` is without them. A resumption takes over RUNNING.
 RUNNING = ("eval_workers", "checkpoint_freq", "keep_checkpoints")
-NOT_RECORDED = ("output", "progress_bar", *RUNNING)
+NOT_IN_CONFIG = ("output", "progress_bar", *RUNNING)
 
 
 @dataclass
@@ -222,7 +222,8 @@ def resume(folder: Path, on_step: Callable[[int], None] | None = None, **running
                 f"{folder} holds a run that was cut off before its first checkpoint: delete it, and start it again."
             )
         for line in (*reversed(found.resumed), found.start):  # Of older versions they do not say how the run was run.
-            running = {**line.get("running", {}), **running}
+            had = line.get("running", {})
+            running = {**{name: had[name] for name in RUNNING if name in had}, **running}
         settings = RunSettings(**{**found.config, **running, "output": str(folder)})
         with (
             prepared(settings, resumed=True) as ready,
@@ -323,7 +324,7 @@ def append_floors(
 
 def recorded_settings(settings: RunSettings) -> dict[str, Any]:
     """Every setting that a result depends on, defaults included, as JSON holds it."""
-    config = {name: value for name, value in asdict(settings).items() if name not in NOT_RECORDED}
+    config = {name: value for name, value in asdict(settings).items() if name not in NOT_IN_CONFIG}
     config["hyperparameters"] = with_defaults(settings.policy, hyperparameters_of(settings))
     return dict(plain(config))
 

@@ -39,7 +39,7 @@ from sb3_momba.pareto.metrics import summarise
 from sb3_momba.pareto.protocol import REFERENCE_POINTS, reference_point_of
 from sb3_momba.recording import RecordWriter, plain
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
-from sb3_momba.runs import NOT_RECORDED, RunSettings, recorded_settings, resume, run
+from sb3_momba.runs import NOT_IN_CONFIG, RunSettings, recorded_settings, resume, run
 from sb3_momba.train import command_of, main, parse
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults
 from tests.stubs import TINY_MLP, TINY_SIMBA, StubEnv, tiny_model
@@ -225,7 +225,7 @@ def test_processor_time_is_not_noted_where_other_processes_work_for_the_training
 
 def test_the_configuration_has_every_setting_with_its_default(tiny_run) -> None:
     config = tiny_run.lines[0]["config"]
-    assert set(config) == {field.name for field in fields(RunSettings)} - set(NOT_RECORDED)
+    assert set(config) == {field.name for field in fields(RunSettings)} - set(NOT_IN_CONFIG)
     assert (config["steps"], config["eval_freq"], config["n_episodes"], config["policy"]) == (120, 60, 2, "SimbaPolicy")
     written = config["hyperparameters"]
     arguments = inspect.signature(MOMBA.__init__).parameters
@@ -303,8 +303,9 @@ def test_a_resumption_keeps_how_the_run_was_run_unless_it_is_told_otherwise(tmp_
     assert not set(first) & set(record.config)
 
 
-def test_a_run_of_which_nothing_says_how_it_was_run_goes_on_with_the_defaults(tmp_path) -> None:
-    """Records of before have no such line."""
+@pytest.mark.parametrize("running", [None, {"env": "no_such_module:X-v0", "unknown": 1}])
+def test_a_run_of_which_nothing_says_how_it_was_run_goes_on_with_the_defaults(tmp_path, running) -> None:
+    """Records of before say nothing; of a stranger's, nothing else than how it was run counts."""
 
     def cut(steps: int) -> None:
         if steps == 70:
@@ -315,7 +316,13 @@ def test_a_run_of_which_nothing_says_how_it_was_run_goes_on_with_the_defaults(tm
         run(settings_of(folder, n_episodes=1, checkpoint_freq=10, keep_checkpoints=4), cut)
     path = folder / "record.jsonl"
     start, *others = lines_of(path)
-    start.pop("running", None)
+    start["running"] = None
+    path.write_text("".join(json.dumps(line) + "\n" for line in (start, *others)))
+    with pytest.raises(FileFormatError, match="running is no mapping"):
+        resume(folder, progress_bar=False)
+    start["running"] = running
+    if running is None:
+        del start["running"]
     path.write_text("".join(json.dumps(line) + "\n" for line in (start, *others)))
     resume(folder, progress_bar=False)
     assert [path.name.partition("-")[2] for path in checkpoints_in(folder / "checkpoints")] == ["000000120", "000000060"]
