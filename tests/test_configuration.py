@@ -83,7 +83,9 @@ def test_classes_are_named_for_what_they_are(key: str, name: str) -> None:
         check_classes(check_entry({key: [name, others[key]]}))
 
 
-@pytest.mark.parametrize("name", ["sb3_momba.files.os.system", "sb3_momba.none.Nothing", "sb3_momba..files.x"])
+@pytest.mark.parametrize(
+    "name", ["sb3_momba.files.os.system", "sb3_momba.none.Nothing", "sb3_momba..files.x", ".x.y", "..a", ""]
+)
 def test_classes_that_are_in_no_module_are_named(name: str) -> None:
     with pytest.raises(ValueError, match=f"callback: '{name}' cannot be imported"):
         check_classes({"callback": name})

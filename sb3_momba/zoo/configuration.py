@@ -1,5 +1,5 @@
 """Reading hyperparameters from yaml in rl_zoo3's format. Values are literals: nothing is evaluated, and of what rl_zoo3
-imports and calls by its name, only callbacks and wrappers are let through."""
+imports and calls by its name, only callbacks and wrappers are called."""
 
 import inspect
 import logging
@@ -148,7 +148,7 @@ def check_classes(entry: dict[str, Any]) -> None:
         module, _, last = name.rpartition(".")
         try:
             found = getattr(import_module(module or name), last, None)
-        except ImportError as error:
+        except (ImportError, TypeError, ValueError) as error:  # the latter two for what is no name
             raise ValueError(f"{key}: {name!r} cannot be imported: {error}") from error
         base = CALLED_BY_RL_ZOO3[key]
         if not (isinstance(found, type) and issubclass(found, base)):
