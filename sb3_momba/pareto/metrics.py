@@ -53,7 +53,8 @@ def hypervolume(values: ArrayLike, reference_point: ArrayLike) -> float:
         return float(moocore.hypervolume(points, ref=reference, maximise=True))
     heights = points - reference
     span = heights.max(axis=0)  # Directions that are equally spaced see nothing of objectives with small units.
-    return float(moocore.hv_approx(heights / span, ref=0, maximise=True, nsamples=N_DIRECTIONS) * span.prod())
+    share = moocore.hv_approx(heights / span, ref=0, maximise=True, nsamples=N_DIRECTIONS, method="Rphi-FWE+")
+    return float(share * span.prod())
 
 
 def expected_utility(values: ArrayLike, preferences: ArrayLike) -> float:
