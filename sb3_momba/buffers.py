@@ -51,7 +51,7 @@ class PreferenceReplayBuffer(ReplayBuffer):
     :param concentration: k of eq. (3.20): w' ~ Dirichlet(k w), its parameters floored at 1e-3
     :param n_relabels: rows of a minibatch that come from one transition, each with a preference of its own
     :param corner_probability: share of the relabelled preferences that are drawn from the corner weights of the newest
-        episodes' returns instead of eq. (3.20), as soon as there are any (after linear support)
+        episodes' returns instead of eq. (3.20), as soon as there are any (after linear support); for six objectives at most
     :param seed: of the buffer's own random stream
     :param handle_timeout_termination: SB3's switch, always on: a truncated episode's last state keeps its value
     :raises ValueError: for a switch that is turned, or a number out of its range
