@@ -290,6 +290,7 @@ def test_nothing_is_kept_where_links_lead(kit, monkeypatch, tmp_path):
 def test_no_page_keeps_through_a_link_in_the_runs_folder(run_folder, tmp_path, monkeypatch):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     monkeypatch.setattr(LiveServer, "serve_forever", lambda self: None)
+    monkeypatch.setattr("sb3_momba.explorer.opening.N_SURVEYED", 2)
     (folder / "kept").symlink_to(tmp_path)
     fail(["live", folder, "--port", "0"], r"kept is a symbolic link to .*: .* with --keep")
     main(["live", str(folder), "--port", "0", "--keep", str(folder / "kept")])

@@ -294,13 +294,12 @@ def serve(
     port: int = PORT,
 ) -> None:
     """Serve the decision kit of a model until Ctrl-C; see `open_kit` and `listen`."""
-    plotly_script()  # What is missing is said before anything is rolled out.
+    plotly_script()  # What is missing is said before anything is rolled out, and where nothing may be written.
+    folder = folder or no_link((path if path.is_dir() else path.parent) / "kept", "--keep")
     if not is_loopback(host):
         logger.warning("Warning: --host %s lets everyone who reaches this machine roll out and keep policies.", host)
     th.set_num_threads(1)  # More of them only slow such small products down.
     with listen(host, port) as listening, open_kit(path, env, seeds, folder) as kit, LiveServer(kit, listening, host) as server:
-        if folder is None:
-            no_link(kit.folder, "--keep")
         logger.info("Open %s in a browser; Ctrl-C ends it.", server.url)
         server.serve_forever()
 
