@@ -126,14 +126,13 @@ class MombaCheckpointCallback(BaseCallback):
             self._end()
 
     def _on_training_end(self) -> None:
-        if not self.model._in_a_step:
-            if self.saved_at < self.model.num_timesteps:
-                self.save()
-        else:
+        if self.model._in_a_step:
             logger.warning(
                 "A callback has stopped the training in the middle of a step: the newest checkpoint is that at %d steps.",
                 self.saved_at,
             )
+        elif self.saved_at < self.model.num_timesteps:
+            self.save()
 
     def save(self) -> None:
         """Write a checkpoint now; not while updates are skipped, so that a training that diverges leaves its last good ones.
