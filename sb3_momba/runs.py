@@ -25,7 +25,7 @@ from sb3_momba.files import LOCK, alone_in
 from sb3_momba.momba import MOMBA
 from sb3_momba.pareto import protocol
 from sb3_momba.pareto.callbacks import ParetoEvalCallback, RecordCallback
-from sb3_momba.pareto.evaluation import ParetoFront, probe_environment
+from sb3_momba.pareto.evaluation import MAX_PARALLEL_EPISODES, ParetoFront, probe_environment
 from sb3_momba.pareto.floors import evaluate_floors
 from sb3_momba.pareto.metrics import summarise
 from sb3_momba.recording import RecordWriter, plain
@@ -36,7 +36,7 @@ from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults, wi
 
 CHECKPOINTS = "checkpoints"
 # No result depends on these: they are no settings of the method, and `config` is without them. A resumption takes over RUNNING.
-RUNNING = ("eval_workers", "checkpoint_freq", "keep_checkpoints")
+RUNNING = ("eval_workers", "eval_envs", "checkpoint_freq", "keep_checkpoints")
 NOT_IN_CONFIG = ("output", "progress_bar", *RUNNING)
 
 
@@ -50,6 +50,7 @@ class RunSettings:
     :param output: the run's folder; must not hold a run already
     :param eval_freq: environment steps between evaluations
     :param eval_workers: processes that share an evaluation
+    :param eval_envs: copies of the environment in each of them, at most
     :param checkpoint_freq: environment steps between checkpoints
     :param keep_checkpoints: how many of them stay
     :param reference_point: of the hypervolume; None: the task's in `pareto/protocol.py`
@@ -73,6 +74,7 @@ class RunSettings:
     preference: list[float] | None = None
     objectives: list[str] | None = None
     eval_workers: int = 1
+    eval_envs: int = MAX_PARALLEL_EPISODES
     checkpoint_freq: int = 10_000
     keep_checkpoints: int = 2
     device: str = "auto"
@@ -110,7 +112,7 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
     """
     if not resumed:  # A record has names in place of classes; the checkpoint has the hyperparameters themselves.
         check_hyperparameters(settings.policy, settings.hyperparameters)
-    for name in ("steps", "checkpoint_freq", "keep_checkpoints"):
+    for name in ("steps", "eval_freq", "n_preferences", "n_episodes", *RUNNING):
         check_whole(name, getattr(settings, name), 1)
     hyperparameters = hyperparameters_of(settings)
     folder = Path(settings.output)
@@ -128,6 +130,7 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
             reference_point=reference_point,
             objectives=settings.objectives,
             n_workers=settings.eval_workers,
+            n_envs=settings.eval_envs,
             log_path=folder,
             best_model_save_path=folder,
             callback_after_eval=RecordCallback(record),
@@ -180,7 +183,8 @@ def run(settings: RunSettings, on_step: Callable[[int], None] | None = None) -> 
         config = recorded_settings(settings)
         start = description(settings, config, ready.preferences, ready.reference_point, sizes)
         with ready.record.start(**start, running=running_settings(settings)) as record:
-            append_floors(record, evaluation.eval_env, ready.preferences, ready.reference_point, settings.n_episodes)
+            env, n_episodes, n_envs = evaluation.eval_env, settings.n_episodes, settings.eval_envs
+            append_floors(record, env, ready.preferences, ready.reference_point, n_episodes, n_envs=n_envs)
             model.set_logger(configure(str(folder), ["csv", "tensorboard"]))
             return _train(settings, ready, record, settings.steps, on_step)
 
@@ -313,10 +317,11 @@ def append_floors(
     reference_point: Sequence[float],
     n_episodes: int,
     general_policy: bool = True,
+    n_envs: int = MAX_PARALLEL_EPISODES,
 ) -> dict[str, dict[str, float]]:
     """Measure policies that learned nothing, and append them to a record; their metrics by the policy's name."""
     measured = {}
-    for name, front in evaluate_floors(env, preferences, n_episodes).items():
+    for name, front in evaluate_floors(env, preferences, n_episodes, n_envs=n_envs).items():
         measured[name] = summarise(front.values, preferences, reference_point, general_policy)
         record.append("floor", policy=name, **measured[name], values=front.values)
     return measured

@@ -107,6 +107,8 @@ def parse(arguments: Sequence[str] | None = None) -> RunSettings:
             f"--architecture {given.architecture}: the configuration {given.conf} is made for {configuration.policy}; leave "
             "one of them out."
         )
+    if given.preference is not None and given.n_preferences != protocol.N_PREFERENCES:
+        raise ValueError(f"--n-preferences {given.n_preferences}: --preference evaluates for one alone; leave one of them out.")
     hyperparameters = configuration.hyperparameters
     if given.preference is not None:
         hyperparameters.pop("preference_sampler", None)
@@ -241,6 +243,7 @@ def add_running_arguments(parser: argparse._ActionsContainer) -> None:
     """Those that no result depends on. Without defaults, as these would win over what a resumed run had."""
     parser.add_argument("--no-progress-bar", dest="progress_bar", action="store_false")
     parser.add_argument("--eval-workers", type=int, help="processes that share an evaluation")
+    parser.add_argument("--eval-envs", type=int, help="copies of the environment in each of them, at most; by default 128")
     parser.add_argument("--checkpoint-freq", type=whole_number, help="environment steps between checkpoints")
     parser.add_argument("--keep-checkpoints", type=int, help="how many stay")
 
@@ -265,7 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             folder = given.resume
             result = resume(folder, progress_bar=given.progress_bar, **running_options(arguments))
-    except (ValueError, MemoryError, ImportError, WorkerError, gym.error.Error) as error:
+    except (ValueError, MemoryError, ImportError, OSError, WorkerError, gym.error.Error) as error:
         sys.exit(f"error: {error}")
     except (KeyboardInterrupt, SystemExit) as ending:
         code = 128 + signal.SIGINT if isinstance(ending, KeyboardInterrupt) else ending.code

@@ -550,6 +550,26 @@ def test_ids_and_callables_run_at_most_128_copies_side_by_side_and_close_them():
     np.testing.assert_allclose(front.returns[:, :, 1], np.outer(weights, [3, 6, 1]), rtol=1e-6)
 
 
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_fewer_copies_give_the_same(n_envs):
+    policy, opened = FirstWeight(), SeededEnv.opened
+    front = evaluate_front(policy, SeededEnv, n_preferences=3, n_episodes=3, seed=4, n_envs=n_envs)
+    assert {len(batch) for batch in policy.seen} == {n_envs}
+    assert SeededEnv.opened - opened == n_envs + 1  # and one that is looked at
+    expected = evaluate_front(FirstWeight(), SeededEnv, n_preferences=3, n_episodes=3, seed=4)
+    np.testing.assert_array_equal(front.returns, expected.returns)
+
+
+def test_an_evaluation_without_copies_or_preferences_is_refused():
+    with pytest.raises(ValueError, match="n_envs=0: at least one copy"):
+        evaluate_front(FirstWeight(), SeededEnv, n_envs=0)
+    with pytest.raises(ValueError, match="n_envs=0: at least one copy"):
+        ParetoEvalCallback(SeededEnv, n_envs=0)
+    for nothing in ([], np.zeros((0, 2))):
+        with pytest.raises(ValueError, match="give at least one preference"):
+            evaluate_front(FirstWeight(), SeededEnv, preferences=nothing)
+
+
 def test_no_more_copies_run_than_episodes():
     policy = FirstWeight()
     evaluate_front(policy, SeededEnv, n_preferences=2, n_episodes=3)
@@ -557,11 +577,10 @@ def test_no_more_copies_run_than_episodes():
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_environments_are_closed_after_an_error(n_envs, monkeypatch):
-    monkeypatch.setattr("sb3_momba.pareto.evaluation.MAX_PARALLEL_EPISODES", n_envs)
+def test_environments_are_closed_after_an_error(n_envs):
     opened, closed = SeededEnv.opened, SeededEnv.closed
     with pytest.raises(RuntimeError, match="the simulator broke"):
-        evaluate_front(FirstWeight(), partial(SeededEnv, fail_at=5), n_preferences=2, n_episodes=2, seed=4)
+        evaluate_front(FirstWeight(), partial(SeededEnv, fail_at=5), n_preferences=2, n_episodes=2, seed=4, n_envs=n_envs)
     assert SeededEnv.closed - closed == SeededEnv.opened - opened
 
 

@@ -297,8 +297,8 @@ def test_a_resumption_keeps_how_the_run_was_run_unless_it_is_told_otherwise(tmp_
     resume(folder, progress_bar=False)
     assert checkpoints() == [120, 110, 100]
     record = read_record(folder / "record.jsonl")
-    first = {"checkpoint_freq": 10, "keep_checkpoints": 4, "eval_workers": 2}
-    told = {"checkpoint_freq": 10, "keep_checkpoints": 3, "eval_workers": 1}
+    first = {"checkpoint_freq": 10, "keep_checkpoints": 4, "eval_workers": 2, "eval_envs": 128}
+    told = {"checkpoint_freq": 10, "keep_checkpoints": 3, "eval_workers": 1, "eval_envs": 128}
     assert [line["running"] for line in (record.start, *record.resumed)] == [first, first, told, told]
     assert not set(first) & set(record.config)
 

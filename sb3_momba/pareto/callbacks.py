@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_momba.envs.preferences import check_preference, preference_grid
 from sb3_momba.envs.registry import copies_of
 from sb3_momba.files import atomic_write
-from sb3_momba.pareto.evaluation import ParetoFront, check_model_fits, evaluate_front, probe_environment
+from sb3_momba.pareto.evaluation import MAX_PARALLEL_EPISODES, ParetoFront, check_model_fits, evaluate_front, probe_environment
 from sb3_momba.pareto.metrics import hypervolume
 from sb3_momba.pareto.plotting import plot_front
 from sb3_momba.pareto.protocol import N_EPISODES, N_PREFERENCES
@@ -58,8 +58,9 @@ class ParetoEvalCallback(EventCallback):
     :param n_workers: processes that share the episodes of an evaluation
     :param verbose: 1 prints a line for each evaluation
     :param preferences: to evaluate instead, (P, n_objectives), each on the simplex
-    :raises ValueError: for eval_freq, n_episodes or n_workers below 1; when the training starts, for what `check` finds, or an
-        eval_env that is the training environment
+    :param n_envs: copies of the environment in each process, at most
+    :raises ValueError: for eval_freq, n_episodes, n_workers or n_envs below 1; when the training starts, for what `check`
+        finds, or an eval_env that is the training environment
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class ParetoEvalCallback(EventCallback):
         n_workers: int = 1,
         verbose: int = 0,
         preferences: ArrayLike | None = None,
+        n_envs: int = MAX_PARALLEL_EPISODES,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
         if eval_freq < 1:
@@ -87,6 +89,8 @@ class ParetoEvalCallback(EventCallback):
             raise ValueError(f"n_episodes={n_episodes}: at least one episode is needed.")
         if n_workers < 1:
             raise ValueError(f"n_workers={n_workers}: at least one process is needed.")
+        if n_envs < 1:
+            raise ValueError(f"n_envs={n_envs}: at least one copy of the environment is needed.")
         self.eval_env = eval_env
         self.copies_training_env = eval_env is None
         self.eval_freq = int(eval_freq)
@@ -97,6 +101,7 @@ class ParetoEvalCallback(EventCallback):
             "deterministic": deterministic,
             "n_workers": n_workers,
             "preferences": preferences,
+            "n_envs": n_envs,
         }
         self.reference_point = reference_point
         self.log_path = None if log_path is None else Path(log_path)
@@ -197,7 +202,7 @@ class ParetoEvalCallback(EventCallback):
             self.warned_of_reference_point = True
             logger.warning(
                 "No value lies above the reference point %s: the hypervolume is 0, and the best model that of the largest "
-                "expected utility. Give reference_point= a point that is worse than what the policies reach.",
+                "expected utility. Give reference_point= (--reference-point) a point that is worse than what policies reach.",
                 np.zeros(front.n_objectives).tolist() if self.reference_point is None else self.reference_point,
             )
         if self.verbose >= 1:

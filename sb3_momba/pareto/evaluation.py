@@ -134,16 +134,17 @@ def evaluate_front(
     deterministic: bool = True,
     env_kwargs: dict[str, Any] | None = None,
     n_workers: int = 1,
+    n_envs: int = MAX_PARALLEL_EPISODES,
 ) -> ParetoFront:
     """Roll a policy out under each preference, all episodes together, one `predict` per step.
 
     Episode e of every preference starts from seed + e. An environment class without any randomness may declare
     `deterministic = True`: with a deterministic policy one episode then stands for all. The policy always sees batches of
-    one shape, so that the result of a deterministic one is the same, bit for bit, for any `n_workers`.
+    one shape, so that the result of a deterministic one is the same, bit for bit, for any `n_workers` and `n_envs`.
 
     :param model: anything with `predict` on observations [s, w]
-    :param env: an id or a callable runs up to 128 copies side by side; a VecEnv as many as it has; an environment that
-        exists already, one episode after the other
+    :param env: of an id or a callable, copies run side by side; a VecEnv has its own; in an environment that exists already,
+        one episode follows the other
     :param n_preferences: how many equally spaced preferences; see `preference_grid`
     :param n_episodes: per preference
     :param seed: of each preference's first episode
@@ -153,6 +154,7 @@ def evaluate_front(
     :param env_kwargs: of an id or a callable; an environment that exists takes none
     :param n_workers: processes that share the episodes; for an id or a callable. As with SB3's SubprocVecEnv, a script needs
         `if __name__ == "__main__":`
+    :param n_envs: copies in each process, at most; fewer take less memory and more time
     :return: P preferences in the order of the grid; returns (P, E, n_objectives), in the units of the rewards, E = n_episodes
         or 1
     :raises ValueError: for a number below 1, a preference off the simplex, or an environment that does not fit the model
@@ -162,23 +164,26 @@ def evaluate_front(
         raise ValueError(f"n_workers={n_workers}: at least one; more of them need an id or a callable that makes environments.")
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes}: at least one episode is needed.")
+    if n_envs < 1:
+        raise ValueError(f"n_envs={n_envs}: at least one copy of the environment is needed.")
+    if preferences is not None and np.size(preferences) == 0:
+        raise ValueError("preferences=[]: give at least one preference, or None for equally spaced ones.")
     gamma = float(getattr(model, "gamma", 0.99)) if gamma is None else gamma
     probe = probe_environment(env, env_kwargs)
     check_model_fits(model, probe)
     grid = preference_grid(probe.n_objectives, n_preferences) if preferences is None else np.atleast_2d(preferences)
-    if len(grid) == 0:
-        raise ValueError("preferences has no rows: give at least one preference.")
     grid = check_preference(grid, probe.n_objectives).astype(np.float64)
     n_run = 1 if probe.deterministic and deterministic else n_episodes
     each = [(w, int(seed) + episode) for w in grid for episode in range(n_run)]
     jobs = [(number, w, one_seed) for number, (w, one_seed) in enumerate(each)]
 
     if n_workers == 1:
-        returns, discounted, lengths = run_jobs(model, env, env_kwargs, jobs, gamma, deterministic)
+        returns, discounted, lengths = run_jobs(model, env, env_kwargs, jobs, gamma, deterministic, n_envs)
     else:
         policy = model.policy if isinstance(model, BaseAlgorithm) else model  # without environments and replay buffer
         parts = [jobs[i::n_workers] for i in range(n_workers)]
-        results = in_processes(run_jobs, [(policy, env, env_kwargs, part, gamma, deterministic) for part in parts if part])
+        calls = [(policy, env, env_kwargs, part, gamma, deterministic, n_envs) for part in parts if part]
+        results = in_processes(run_jobs, calls)
         n_objectives = grid.shape[1]
         returns, discounted = np.zeros((2, len(jobs), n_objectives))
         lengths = np.zeros(len(jobs), dtype=np.int64)
@@ -206,13 +211,14 @@ def run_jobs(
     jobs: Jobs,
     gamma: float,
     deterministic: bool,
+    n_envs: int = MAX_PARALLEL_EPISODES,
     still_alive: Callable[[], None] = lambda: None,
 ) -> Measured:
     """Returns (n_jobs, n_objectives), discounted ones, and lengths (n_jobs,).
 
     :param still_alive: called at each step
     """
-    venv, is_ours = _make_vec_env(env, min(len(jobs), MAX_PARALLEL_EPISODES), env_kwargs)
+    venv, is_ours = _make_vec_env(env, min(len(jobs), n_envs), env_kwargs)
     n_threads = th.get_num_threads()
     # Sampling actions must not disturb the random numbers of a training that is going on.
     with th.random.fork_rng(enabled=not deterministic):

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_momba.pareto.evaluation import ParetoFront, evaluate_front, probe_environment
+from sb3_momba.pareto.evaluation import MAX_PARALLEL_EPISODES, ParetoFront, evaluate_front, probe_environment
 from sb3_momba.pareto.protocol import N_EPISODES
 
 MEASURED = ("returns", "discounted_returns", "episode_lengths")
@@ -40,19 +40,23 @@ class RandomPolicy:
 
 
 def evaluate_floors(
-    env: str | gym.Env | VecEnv | Callable[[], gym.Env], preferences: np.ndarray, n_episodes: int = N_EPISODES, seed: int = 0
+    env: str | gym.Env | VecEnv | Callable[[], gym.Env],
+    preferences: np.ndarray,
+    n_episodes: int = N_EPISODES,
+    seed: int = 0,
+    n_envs: int = MAX_PARALLEL_EPISODES,
 ) -> dict[str, ParetoFront]:
     """Both, under the protocol of a learned policy.
 
     Random actions give a set of P noisy points, whose hypervolume is above that of their mean: a floor that favours nobody.
 
     :param preferences: (P, n_objectives)
+    :param n_envs: copies of the environment, at most
     """
     action_space = probe_environment(env).action_space
-    random = evaluate_front(
-        RandomPolicy(action_space, seed), env, preferences=preferences, n_episodes=n_episodes, seed=seed, deterministic=False
-    )
-    still = evaluate_front(ZeroActionPolicy(action_space), env, preferences=preferences[:1], n_episodes=n_episodes, seed=seed)
+    protocol: dict[str, Any] = {"n_episodes": n_episodes, "seed": seed, "n_envs": n_envs}
+    random = evaluate_front(RandomPolicy(action_space, seed), env, preferences=preferences, deterministic=False, **protocol)
+    still = evaluate_front(ZeroActionPolicy(action_space), env, preferences=preferences[:1], **protocol)
     # It is the same under every preference.
     tiled: dict[str, Any] = {name: np.repeat(getattr(still, name), len(preferences), axis=0) for name in MEASURED}
     return {"standing still": replace(still, preferences=random.preferences, **tiled), "random actions": random}
