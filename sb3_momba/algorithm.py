@@ -263,15 +263,6 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         if self.preference_alignment and self.preference_alignment != "positive":
             self._negative_returns.add(rewards, dones)
 
-    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
-        """As if its transitions had been stored one after another."""
-        rows = np.arange(buffer.n_added - buffer.size(), buffer.n_added) % buffer.buffer_size
-        for first in range(0, len(rows), 10_000):
-            observations = buffer.observations[rows[first : first + 10_000]]
-            self.policy.statistics.update(observations.reshape(-1, buffer.observation_dim))
-        for row in rows:
-            self._observe_rewards(buffer.rewards[row], buffer.dones[row])
-
     def _setup_learn(
         self,
         total_timesteps: int,
@@ -299,6 +290,9 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
             self.replay_buffer.end_episodes()
         self.replay_buffer.check_memory()
         total_timesteps, root = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self.num_timesteps < total_timesteps <= self.learning_starts:
+            advice = "take more steps, or start earlier."
+            logger.warning("Nothing is learned before learning_starts=%d steps: %s", self.learning_starts, advice)
         self._root_callback = given_callback(root)
         forgive_full_disks(self.logger)
         if self._states_of_callbacks is not None:
@@ -348,7 +342,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         return max(int(self._total_timesteps) - self.num_timesteps, 0)
 
     @classmethod
-    def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Self:
+    def resume(cls: type[Self], path: str | os.PathLike[str], env: GymEnv, replay: bool = True, **kwargs: Any) -> Self:
         """The training as it was at a checkpoint: `learn(model.remaining_timesteps, callback, reset_num_timesteps=False)` goes
         on exactly as if nothing had happened, callbacks of the same kinds in the same places included: SB3's own, and others
         that have `state_dict` and `load_state_dict`. The same holds for the bits of every number on the same machine with the
@@ -357,8 +351,10 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
 
         :param path: folder of a MombaCheckpointCallback, or one of the checkpoints in it; damaged ones are passed over
         :param env: an environment of the same kind, and as many
-        :param kwargs: of `load`
+        :param replay: brings running episodes back by their actions, from their reset on, here and now. False, for a machine
+            that must not move by itself, only resets: these episodes end, as truncated, where the checkpoint was
+        :param kwargs: of `load`, without a seed
         :raises FileFormatError: if no checkpoint is whole, naming what is damaged
         :raises ValueError: if `env` is not of that kind
         """
-        return resume(cls, path, env, **kwargs)
+        return resume(cls, path, env, replay, **kwargs)

@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
@@ -219,8 +220,17 @@ class PickleFreeSaving(OffPolicyAlgorithm):
     def _make_replay_buffer(self) -> PreferenceReplayBuffer:
         raise NotImplementedError
 
-    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
+    def _observe_rewards(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         raise NotImplementedError
+
+    def _take_statistics_from(self, buffer: PreferenceReplayBuffer) -> None:
+        """As if its transitions had been stored one after another."""
+        rows = np.arange(buffer.n_added - buffer.size(), buffer.n_added) % buffer.buffer_size
+        for first in range(0, len(rows), 10_000):
+            observations = buffer.observations[rows[first : first + 10_000]]
+            self.policy.statistics.update(observations.reshape(-1, buffer.observation_dim))
+        for row in rows:
+            self._observe_rewards(buffer.rewards[row], buffer.dones[row])
 
     def _check_buffer_fits(self, tree: dict[str, Any]) -> None:
         ours = self._make_replay_buffer() if self.replay_buffer is None else self.replay_buffer

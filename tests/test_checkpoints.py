@@ -158,6 +158,28 @@ def test_an_environment_that_cannot_be_brought_back_is_named(tmp_path):
     model.learn(20, reset_num_timesteps=False)
 
 
+class Machine(StubEnv):
+    """Counts how often it has moved."""
+
+    moves = 0
+
+    def step(self, action):
+        Machine.moves += 1
+        return super().step(action)
+
+
+def test_a_machine_does_not_move_by_itself(tmp_path, recwarn):
+    checkpointed(Machine(), tmp_path, 65, 100)
+    Machine.moves = 0
+    model = MOMBA.resume(tmp_path, Machine(), replay=False)
+    assert Machine.moves == 0
+    assert [str(warning.message) for warning in recwarn] == []
+    last = model.replay_buffer.pos - 1
+    assert (model.replay_buffer.dones[last], model.replay_buffer.timeouts[last]) == (1, 1)
+    model.learn(20, reset_num_timesteps=False)
+    assert Machine.moves == 20
+
+
 class OwnRewards(StubEnv):
     """Draws its rewards from such a stream, and shows nothing of it."""
 
@@ -424,6 +446,8 @@ def test_another_number_of_environments_is_refused(three_checkpoints):
 def test_settings_that_cannot_be_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"env=None: resuming .* needs the training's environment"):
         MOMBA.resume(tmp_path, None)
+    with pytest.raises(ValueError, match="seed=5: the random numbers of a checkpoint go on"):
+        MOMBA.resume(tmp_path, StubEnv(), seed=5)
     with pytest.raises(ValueError, match="save_freq=0"):
         MombaCheckpointCallback(0, tmp_path)
     with pytest.raises(ValueError, match="keep=0"):

@@ -37,10 +37,12 @@ def write_checkpoint(model: Any, writer: CheckpointWriter) -> None:
     writer.write(model.num_timesteps, {MODEL: model.tree(), STATE: state}, segments)
 
 
-def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs: Any) -> Model:
+def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, replay: bool = True, **kwargs: Any) -> Model:
     """See `MOMBA.resume`."""
     if env is None:
         raise ValueError(f"env=None: resuming {path} needs the training's environment.")
+    if "seed" in kwargs:
+        raise ValueError(f"seed={kwargs['seed']!r}: the random numbers of a checkpoint go on. Leave it out.")
     checkpoint = newest(path)
     missing = [file for file in (MODEL, STATE) if file not in checkpoint.files]
     if missing:
@@ -57,17 +59,13 @@ def resume(cls: type[Model], path: str | os.PathLike[str], env: GymEnv, **kwargs
             raise FileFormatError(f"{checkpoint.folder / MODEL} has last observations of shape {np.shape(last)}.")
         read_segments(model.replay_buffer, checkpoint, state["buffer"])
         set_statistics(model, state["statistics"])
-    _bring_back_environments(model, episodes)
+    model._last_obs, ended = environments.bring_back(model.env, episodes, model._last_obs, replay)
+    if ended:
+        model.replay_buffer.end_episodes(ended)
+        model.policy.return_scale.end_episodes(ended)
+        model._negative_returns.end_episodes(ended)
     with content_of(checkpoint.folder):
         set_random_states(model, state["random"])
         model._states_of_callbacks = dict(state["callbacks"])
     model._resumed_from = checkpoint, model.replay_buffer
     return model  # type: ignore[no-any-return]
-
-
-def _bring_back_environments(model: Any, episodes: list[dict[str, Any]] | None) -> None:
-    model._last_obs, lost = environments.bring_back(model.env, episodes, model._last_obs)
-    if lost:
-        model.replay_buffer.end_episodes(lost)
-        model.policy.return_scale.end_episodes(lost)
-        model._negative_returns.end_episodes(lost)

@@ -55,20 +55,24 @@ def check_generator(state: Any) -> None:
         raise TypeError(f"no state of random numbers: {error}") from error
 
 
-def bring_back(env: VecEnv, states: list[dict[str, Any]] | None, observations: np.ndarray) -> tuple[np.ndarray, list[int]]:
+def bring_back(
+    env: VecEnv, states: list[dict[str, Any]] | None, observations: np.ndarray, replay: bool = True
+) -> tuple[np.ndarray, list[int]]:
     """Play each running episode again.
 
     :param states: as `states_of` gave them
     :param observations: [s, w] where the training stopped, (n_envs, observation_dim + preference_dim)
-    :return: [s, w] to go on from, like observations, and the environments whose episodes could not be brought back
+    :param replay: False resets all environments instead
+    :return: [s, w] to go on from, like observations, and the environments whose episodes end instead
     """
     env._reset_seeds()
     env._reset_options()
-    if isinstance(env, VecEnvWrapper):
+    if isinstance(env, VecEnvWrapper) or not replay:
         for index, state in enumerate(states or []):
             (given,) = env.env_method("begin_replay", state, indices=[index])
             env.unwrapped._seeds[index], env.unwrapped._options[index] = given["seed"], given["options"] or {}
-        _warn(list(range(env.num_envs)), f"{type(env).__name__} around them has a state of its own.")
+        if replay:
+            _warn(list(range(env.num_envs)), f"{type(env).__name__} around them has a state of its own.")
         return np.asarray(env.reset()), list(range(env.num_envs))
     observations, lost = observations.copy(), []
     for index in range(env.num_envs):
