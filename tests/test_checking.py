@@ -124,6 +124,17 @@ def test_what_is_seldom_meant_is_a_warning(settings, message):
         check_mo_env(Fresh, n_steps=30, env_kwargs=settings)
 
 
+def test_a_machine_is_run_once_and_not_compared():
+    class Machine(Fresh):
+        def step(self, action):
+            observation, *others = super().step(action)
+            return observation + np.random.default_rng().random(3), *others
+
+    with pytest.raises(ValueError, match=r"Two runs with the same seed .* ask for reproducible=False"):
+        check_mo_env(Machine, n_steps=30)
+    check_mo_env(Machine, n_steps=30, reproducible=False)
+
+
 def test_a_reset_without_options_is_named():
     class Old(Fresh):
         def reset(self, seed=None):

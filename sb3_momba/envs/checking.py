@@ -31,7 +31,13 @@ class Rollout:
     n_episodes: int
 
 
-def check_mo_env(env: EnvLike, n_steps: int = 1_000, seed: int = 0, env_kwargs: dict[str, Any] | None = None) -> None:
+def check_mo_env(
+    env: EnvLike,
+    n_steps: int = 1_000,
+    seed: int = 0,
+    env_kwargs: dict[str, Any] | None = None,
+    reproducible: bool = True,
+) -> None:
     """Run an environment with random actions and name what is wrong with it.
 
     Errors are what a training would stop at, or learn wrong things from: spaces, shapes, types, numbers that are not finite or
@@ -42,17 +48,18 @@ def check_mo_env(env: EnvLike, n_steps: int = 1_000, seed: int = 0, env_kwargs: 
     :param n_steps: how long, over as many episodes as that takes
     :param seed: of the first reset and of the actions, uniform within their bounds
     :param env_kwargs: of an id or a callable; an environment that exists takes none
+    :param reproducible: False for a machine, whose runs no seed repeats: it is run once, and not compared
     :raises ValueError: naming what is wrong, and the cure
     """
     made = make_env(env, env_kwargs)
     try:
-        _check(made, n_steps, seed)
+        _check(made, n_steps, seed, reproducible)
     finally:
         if made is not env:
             made.close()
 
 
-def _check(env: gym.Env, n_steps: int, seed: int) -> None:
+def _check(env: gym.Env, n_steps: int, seed: int, reproducible: bool) -> None:
     if is_wrapped(env, PreferenceWrapper):
         raise ValueError("This environment is in PreferenceWrapper already: check the one inside, which has the vector reward.")
     _check_interface(env.unwrapped, seed)
@@ -61,13 +68,14 @@ def _check(env: gym.Env, n_steps: int, seed: int) -> None:
     assert isinstance(box, spaces.Box)
     actions = np.random.default_rng(seed).uniform(box.low, box.high, (n_steps, *box.shape)).astype(box.dtype)
 
-    rollout, again = _run(wrapped, actions, seed), _run(wrapped, actions, seed)
+    rollout = _run(wrapped, actions, seed)
     errors = _outside("observation_space", env.observation_space, rollout.observations)
     errors += _outside("reward_space", declared_reward_space(env), rollout.rewards)
-    if not _are_equal(rollout, again):
+    if reproducible and not _are_equal(rollout, _run(wrapped, actions, seed)):
         errors.append(
             "Two runs with the same seed and actions differ: draw random numbers from self.np_random alone, call "
-            "super().reset(seed=seed) first, and let reset set every variable that step changes."
+            "super().reset(seed=seed) first, and let reset set every variable that step changes. Of a machine, which cannot "
+            "be repeated, ask for reproducible=False."
         )
     elif getattr(env.unwrapped, "deterministic", False) and not _are_equal(rollout, _run(wrapped, actions, seed + 1)):
         errors.append("It declares deterministic = True, and another seed gives another run: leave the declaration out.")
