@@ -25,7 +25,7 @@ from sb3_momba.nn.products import fast_float32_products, product_dtype
 from sb3_momba.nn.speed import without_weight_gradients
 from sb3_momba.policies import SHIPPED_POLICIES
 from sb3_momba.policy import MombaPolicy
-from sb3_momba.settings import check_other_arguments, parameters
+from sb3_momba.settings import check_device, check_other_arguments, parameters
 
 MAX_SKIPPED_UPDATES = 20
 
@@ -142,6 +142,7 @@ class MOMBA(PreferenceConditionedAlgorithm):
         **others: Any,
     ):
         check_other_arguments(others, parameters(type(self)))
+        check_device(device)
         if env is None and _init_setup_model:
             raise ValueError("env=None: MOMBA needs an environment to train on; MOMBA.load(path) needs none to predict.")
         super().__init__(

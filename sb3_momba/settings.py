@@ -1,6 +1,7 @@
 """What MOMBA's settings may be. Every check raises a ValueError that names the setting, its value and the cure."""
 
 import inspect
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
@@ -8,6 +9,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from torch import nn
 
@@ -16,6 +18,8 @@ from sb3_momba.nn.products import PRECISIONS
 from sb3_momba.nn.speed import has_compiler
 from sb3_momba.policies import SHIPPED_POLICIES, MlpPolicy
 from sb3_momba.policy import MombaPolicy
+
+logger = logging.getLogger(__name__)
 
 SWITCHES = ("vector_values", "reward_centering", "her", "compile", "deterministic_exploration", "optimize_memory_usage")
 # The least that they may be.
@@ -90,6 +94,9 @@ def check_settings(model: Any) -> None:
         check_whole(name, settings[name], least)
     if settings["reset_interval"] is not None:
         check_whole("reset_interval", settings["reset_interval"], 1, ", or None for never")
+    check_whole("train_freq", model.train_freq.frequency, 1)
+    check_whole("stats_window_size", settings["_stats_window_size"], 1)
+    check_seed(settings["seed"])
     if settings["gradient_steps"] != -1:
         check_whole("gradient_steps", settings["gradient_steps"], 0, "; -1 makes as many as steps were taken")
     for name, (low, high) in RANGES.items():
@@ -224,9 +231,20 @@ def check_policy_kwargs(policy: type, policy_kwargs: Any) -> None:
         check_support(policy_kwargs["support"])
     if policy_kwargs.get("net_arch") is not None:
         check_net_arch(policy_kwargs["net_arch"])
+    check_optimizer(policy_kwargs.get("optimizer_class", th.optim.Adam), policy_kwargs.get("optimizer_kwargs"))
     activation = policy_kwargs.get("activation_fn", nn.ReLU)
     if not isinstance(activation, type) or not issubclass(activation, nn.Module):
         raise ValueError(f"policy_kwargs activation_fn={activation!r}: give a class of torch.nn, such as torch.nn.Tanh.")
+
+
+def check_optimizer(optimizer: Any, arguments: Any) -> None:
+    if not isinstance(optimizer, type) or not issubclass(optimizer, th.optim.Optimizer):
+        raise ValueError(
+            f"policy_kwargs optimizer_class={optimizer!r}: give a class of torch.optim, such as torch.optim.AdamW, in Python."
+        )
+    if arguments is not None:
+        known = [name for name in parameters(optimizer) if name not in ("self", "params", "lr")]
+        check_names("policy_kwargs optimizer_kwargs", arguments, known, f"here {optimizer.__name__} takes no")
 
 
 def check_support(support: Any) -> None:
@@ -279,6 +297,24 @@ def parse_target_entropy(target_entropy: str | float, action_dim: int) -> float:
 def check_switch(name: str, value: Any, otherwise: str = "") -> None:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name}={value!r}: it is a switch, give True or False{otherwise}.")
+
+
+def check_seed(seed: Any) -> None:
+    if seed is not None and not (is_whole(seed, 0) and seed < 2**32):
+        raise ValueError(f"seed={seed!r}: give a whole number from 0 to 2**32 - 1, or None for another run each time.")
+
+
+def check_device(device: Any) -> None:
+    """Where there is no GPU, SB3 takes the CPU instead, which is said.
+
+    :raises ValueError: for what torch does not know
+    """
+    try:
+        kind = "cpu" if device == "auto" else th.device(device).type
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f'device={device!r}: give "cpu", "cuda", "cuda:1" and the like, or "auto".') from error
+    if kind == "cuda" and not th.cuda.is_available():
+        logger.warning("device=%r: torch finds no GPU here, so the CPU is used.", str(device))
 
 
 def check_whole(name: str, value: Any, least: int, otherwise: str = "") -> None:

@@ -32,6 +32,12 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
                 return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
         try:
             return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
+        except gym.error.UnregisteredEnv as error:
+            if ":" in env:
+                raise
+            raise type(error)(
+                f"{str(error).rstrip('.')}. If it is your own, name the module that registers it too: 'my_module:{env}'."
+            ) from error
         except TypeError as error:
             if not env_kwargs:
                 raise

@@ -20,7 +20,15 @@ from sb3_momba.envs.registry import PREFIX, raw_id
 from sb3_momba.momba import MOMBA
 from sb3_momba.policy import MombaPolicy
 from sb3_momba.recording import plain
-from sb3_momba.settings import check_policy_kwargs, check_whole, nearest, parameters, policy_parameters
+from sb3_momba.settings import (
+    OF_SAC,
+    check_other_arguments,
+    check_policy_kwargs,
+    check_whole,
+    nearest,
+    parameters,
+    policy_parameters,
+)
 
 SHIPPED = resources.files("sb3_momba.zoo") / "hyperparams"
 RUN_KEYS = ("n_timesteps", "policy", "n_envs", "normalize", "env_kwargs", "callback")
@@ -32,9 +40,13 @@ LINEAR = "lin_"
 WITH_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d{1,3}")
 N_TIMESTEPS = 1_000_000  # where neither file nor command line says
 POLICIES = MOMBA.policy_aliases
-NOT_FOR_CONFIGURATIONS = {
-    *("self", "policy", "env", "seed", "tensorboard_log", "verbose", "device", "_init_setup_model", "others"),
+# What belongs to a run, not to a method: how the command line has it.
+OF_A_RUN = {
+    **{"policy": "give --architecture", "env": "give --env", "env_kwargs": "give --env-kwargs", "n_envs": "give --n-envs"},
+    **{"n_timesteps": "give --steps", "seed": "give --seed", "device": "give --device"},
+    **{"tensorboard_log": "a run's folder has its logs", "verbose": "a run's folder has its logs"},
 }
+NOT_FOR_CONFIGURATIONS = {*OF_A_RUN, "self", "_init_setup_model", "others"}
 
 logger = logging.getLogger(__name__)
 
@@ -199,8 +211,14 @@ def check_hyperparameters(policy: str, hyperparameters: dict[str, Any]) -> None:
     if not isinstance(policy, str) or policy not in POLICIES:
         raise ValueError(f"The policy {policy!r} is not known{nearest(policy, POLICIES)}")
     known = [name for name in parameters(MOMBA) if name not in NOT_FOR_CONFIGURATIONS]
-    for name in hyperparameters:
-        if name not in known:
+    for name, value in hyperparameters.items():
+        if name in OF_A_RUN or name in RUN_KEYS:
+            raise ValueError(f"{name}={value!r} is no hyperparameter: {OF_A_RUN.get(name, 'only a yaml file has it')}.")
+        if name in ZOO_KEYS:
+            raise ValueError(f"{name}={value!r} needs rl_zoo3: write it into a yaml file for python -m sb3_momba.zoo train.")
+        if name in OF_SAC:
+            check_other_arguments({name: value}, known)
+        elif name not in known:
             raise ValueError(f"MOMBA has no hyperparameter {name!r}{nearest(name, [*known, *RUN_KEYS, *ZOO_KEYS])}")
     check_policy_kwargs(POLICIES[policy], hyperparameters.get("policy_kwargs") or {})
 
