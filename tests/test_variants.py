@@ -311,6 +311,7 @@ def test_momba_plus_differs_between_tasks_in_what_stands_here_alone(env_id: str)
         "MO-HalfCheetah-v4": {"gamma"},
         "MO-Hopper-v4": hopper,
         "MO-Hopper-3obj-v4": hopper,
+        "MO-Walker2d-v4": hopper,
         "MO-Swimmer-v4": hopper | {"gamma", "noise_repeat"},
     }
     default, entry = (read_configuration("momba_plus", name) for name in ("StubEnv-v0", env_id))
