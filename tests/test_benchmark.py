@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import IO, Any
 
 import gymnasium as gym
+import matplotlib.image
 import numpy as np
 import pytest
 import yaml
@@ -858,6 +859,17 @@ def test_fronts_are_drawn_of_two_or_three_objectives(fake, tmp_path, n_objective
     made = [fake(values, {10: values, 20: values}, floors=floors, **shape)]
     report_of(tmp_path / "report", made)
     assert len(list((tmp_path / "report").glob("*.png"))) == (2 if n_objectives == 3 else 1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_names_with_many_settings_are_below_the_axes(fake, tmp_path) -> None:
+    curve = {10: box(1.0), 20: FRONT}
+    settings = [{f"setting_{i}": i + j for i in range(12)} for j in range(3)]
+    report_of(tmp_path / "report", [fake(FRONT, curve, settings=hyperparameters(**one)) for one in settings])
+    for path in (tmp_path / "report").glob("*.png"):
+        height, width, _ = matplotlib.image.imread(path).shape
+        assert width == 900
+        assert height > 675 + 3 * 60  # The canvas has grown by three names of three lines or more.
 
 
 def test_a_report_of_one_evaluation(fake, tmp_path) -> None:

@@ -1317,6 +1317,30 @@ def test_more_runs_than_colours():
     assert len(axes.get_legend().get_texts()) == 9
 
 
+@pytest.mark.parametrize("values", [STAIRS, SOLID], ids=["2 objectives", "3 objectives"])
+@pytest.mark.parametrize(
+    "names",
+    [[f"run {i} ({', '.join(['cost=$1'] * 12)})" for i in range(4)], [f"run {i}" for i in range(30)]],
+    ids=["long", "many"],
+)
+@pytest.mark.filterwarnings("error")
+def test_a_large_legend_covers_nothing_and_takes_nothing_from_the_axes(values, names, tmp_path):
+    small, large = (
+        plot_front({name: values + i for i, name in enumerate(several)}, tmp_path / "front.png") for several in (["a"], names)
+    )
+    areas = []
+    for figure in (small, large):
+        figure.draw_without_rendering()
+        areas.append(figure.axes[0].bbox)
+    legend = large.axes[0].get_legend() or large.legends[0]
+    assert [text.get_text().replace("\n", " ") for text in legend.get_texts()] == [name.replace("$", r"\$") for name in names]
+    area = legend.get_window_extent()
+    assert 0 < area.x0 < area.x1 < large.bbox.x1
+    assert 0 < area.y0 < area.y1 < areas[1].y0
+    assert areas[1].width > 0.95 * areas[0].width
+    assert areas[1].height > 0.95 * areas[0].height
+
+
 @pytest.mark.parametrize(
     ("name", "start"), [("front.pdf", b"%PDF"), ("front.svg", b"<?xml"), ("front.PNG", PNG), ("front", PNG)]
 )

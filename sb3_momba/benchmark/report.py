@@ -16,7 +16,7 @@ from sb3_momba.benchmark.statistics import estimate, interquartile_mean, probabi
 from sb3_momba.benchmark.tables import as_text, markdown, one_line
 from sb3_momba.files import atomic_write
 from sb3_momba.methods import differing, method_settings
-from sb3_momba.pareto.plotting import default_style, plot_front, save_figure, verbatim
+from sb3_momba.pareto.plotting import add_legend, default_style, plot_front, save_figure, verbatim
 from sb3_momba.records import UNENDED, Record, find_records, is_cut_off_at_its_start, read_record
 from sb3_momba.train import whole_number
 
@@ -266,7 +266,7 @@ def draw_curves(task: Task, path: Path) -> bool:
         axes.axhline(volume, color="grey", linestyle=style, linewidth=1, label=name)
     axes.set(xlabel="environment steps", ylabel="hypervolume (IQM, 95 %)", title=verbatim(task.name), ylim=(0, None))
     axes.grid(alpha=0.3)
-    axes.legend()
+    add_legend(figure, axes)
     save_figure(figure, path)
     return True
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:  # It takes half a second to import, and few processes draw.
 # Okabe & Ito (2008): told apart by the colour-blind.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+# The most names of a legend on the axes, and the most characters in a line of it there and below them.
+NAMES_ON_AXES, LINE_ON_AXES, LINE_BELOW = 15, 40, 60
 
 Fronts = ParetoFront | ArrayLike | Mapping[str, "ParetoFront | ArrayLike"]
 
@@ -56,7 +59,7 @@ def plot_front(
         scatter_front(axes, p, name, i)
     label_axes(axes, labels, title)
     if any(points):
-        axes.legend()
+        add_legend(figure, axes)
     if path is not None:
         save_figure(figure, path)
     return figure
@@ -85,6 +88,21 @@ def verbatim(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def in_legend(name: str) -> str:
+    """A name as the legend has it, in several lines where it is long."""
+    return verbatim(textwrap.fill(name, LINE_BELOW))
+
+
+def add_legend(figure: "Figure", axes: "Axes") -> None:
+    """On the axes; with a long name or many names below them, on a canvas that grows by it, so that it covers nothing."""
+    handles, names = axes.get_legend_handles_labels()
+    if len(names) <= NAMES_ON_AXES and all(len(name) <= LINE_ON_AXES for name in names):
+        axes.legend()
+        return
+    legend = figure.legend(handles, names, loc="outside lower center")
+    figure.set_figheight(figure.get_figheight() + legend.get_window_extent().height / figure.dpi)
+
+
 def scatter_front(axes: "Axes", points: np.ndarray, name: str, style: int) -> None:
     """One solution set on two- or three-dimensional axes; dominated solutions are faint.
 
@@ -96,7 +114,7 @@ def scatter_front(axes: "Axes", points: np.ndarray, name: str, style: int) -> No
     on_front = non_dominated(points)
     axes.scatter(*points[~on_front].T, color=colour, marker=marker, s=14, alpha=0.25)  # type: ignore[misc]
     front = points[on_front]
-    axes.scatter(*front.T, color=colour, marker=marker, s=26, label=verbatim(name))  # type: ignore[misc]
+    axes.scatter(*front.T, color=colour, marker=marker, s=26, label=in_legend(name))  # type: ignore[misc]
     if points.shape[1] == 2:
         front = front[front[:, 0].argsort()]
         axes.plot(*front.T, color=colour, linewidth=1, alpha=0.6)
