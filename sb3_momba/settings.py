@@ -160,8 +160,10 @@ def _check_together(model: Any, settings: Mapping[str, Any]) -> None:
         )
     if model.critic_minimum == "objective" and not model.vector_values:
         raise ValueError("critic_minimum='objective' needs a Q for each objective: set vector_values=True.")
-    if model.n_objectives == 1 and (model.her or model.preference_alignment):
-        raise ValueError("her and preference_alignment need two objectives or more: with one there is no preference.")
+    for name in ("her", "preference_alignment"):
+        value = getattr(model, name)
+        if model.n_objectives == 1 and value:
+            raise ValueError(f"{name}={value!r} with one objective: there is no preference: set {name}=False.")
     if model.her_kwargs is not None:
         if not model.her:
             raise ValueError(f"her_kwargs={model.her_kwargs} without her=True: set her=True, or leave them out.")

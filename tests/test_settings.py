@@ -54,6 +54,12 @@ def test_a_setting_that_cannot_be_is_named(message):
     assert message in str(error.value)
 
 
+@pytest.mark.parametrize(("name", "value"), [("her", True), ("preference_alignment", "positive")])
+def test_what_needs_a_preference_is_named_where_there_is_one_objective(name, value):
+    with pytest.raises(ValueError, match=rf"^{name}={value!r} with one objective: .* set {name}=False\.$"):
+        MOMBA("SimbaPolicy", StubEnv(n_objectives=1), buffer_size=10, vector_values=True, **{name: value})
+
+
 @pytest.mark.parametrize("net_arch", [[8, 0], 8, {"pi": [8]}], ids=str)
 def test_widths_that_cannot_be_are_named(net_arch):
     with pytest.raises(ValueError, match=r"net_arch=.*: give a list of widths"):
