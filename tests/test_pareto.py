@@ -49,7 +49,7 @@ from sb3_momba.envs.preferences import PerStepSampler, UniformSampler, preferenc
 from sb3_momba.files import FileFormatError, write_tree
 from sb3_momba.pareto.floors import RandomPolicy, ZeroActionPolicy
 from sb3_momba.pareto.metrics import non_dominated
-from sb3_momba.pareto.plotting import COLOURS
+from sb3_momba.pareto.plotting import COLOURS, style_of
 from tests.stubs import StubEnv, assert_same_tree, tiny_model
 
 pytestmark = [
@@ -1313,8 +1313,8 @@ def test_several_runs_have_their_colours_and_names(values, tmp_path):
 
 
 def test_more_runs_than_colours():
-    (axes,) = plot_front({f"run {i}": STAIRS + i for i in range(9)}).axes
-    assert len(axes.get_legend().get_texts()) == 9
+    (legend,) = plot_front({f"run {i}": STAIRS + i for i in range(9)}).legends
+    assert len(legend.get_texts()) == 9
 
 
 @pytest.mark.parametrize("values", [STAIRS, SOLID], ids=["2 objectives", "3 objectives"])
@@ -1463,3 +1463,9 @@ def test_an_error_in_a_worker_reaches_the_caller():
 class Speechless:
     def predict(self, observation, *, deterministic):
         raise RuntimeError("no answer")
+
+
+def test_many_things_in_a_picture_are_told_apart():
+    styles = [style_of(i) for i in range(28)]
+    assert len(set(styles)) == len({(colour, marker) for colour, marker, _ in styles}) == 28
+    assert [line for _, _, line in styles[:8]] == ["-"] * 7 + ["--"]

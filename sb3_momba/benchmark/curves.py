@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from sb3_momba.benchmark.statistics import Estimate, estimate, interquartile_mean
-from sb3_momba.pareto.plotting import COLOURS, MARKERS, in_legend
+from sb3_momba.pareto.plotting import in_legend, style_of
 
 Array = NDArray[np.float64]
 
@@ -34,8 +34,8 @@ def curve_through(steps: Array, tasks: Sequence[Array]) -> Curve:
 
 def draw_curve(axes: Axes, curve: Curve, name: str, style: int) -> None:
     """A line and the band of its interval; a single point is a mark."""
-    colour = COLOURS[style % len(COLOURS)]
-    marker = MARKERS[style % len(MARKERS)] if len(curve.steps) == 1 else None
-    axes.plot(curve.steps, [point.value for point in curve.points], color=colour, marker=marker, label=in_legend(name))
+    colour, marker, line = style_of(style)
+    values = [point.value for point in curve.points]
+    axes.plot(curve.steps, values, line, color=colour, marker=marker if len(values) == 1 else None, label=in_legend(name))
     low, high = [point.low for point in curve.points], [point.high for point in curve.points]
     axes.fill_between(curve.steps, low, high, color=colour, alpha=0.2, linewidth=0)

@@ -20,8 +20,9 @@ if TYPE_CHECKING:  # It takes half a second to import, and few processes draw.
 # Okabe & Ito (2008): told apart by the colour-blind.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+LINES = ("-", "--", ":", "-.")
 # The most names of a legend on the axes, and the most characters in a line of it there and below them.
-NAMES_ON_AXES, LINE_ON_AXES, LINE_BELOW = 15, 40, 60
+NAMES_ON_AXES, LINE_ON_AXES, LINE_BELOW = 8, 40, 60
 
 Fronts = ParetoFront | ArrayLike | Mapping[str, "ParetoFront | ArrayLike"]
 
@@ -99,8 +100,15 @@ def add_legend(figure: "Figure", axes: "Axes") -> None:
     if len(names) <= NAMES_ON_AXES and all(len(name) <= LINE_ON_AXES for name in names):
         axes.legend()
         return
-    legend = figure.legend(handles, names, loc="outside lower center")
+    columns = max(1, LINE_BELOW // max(len(name) + 5 for name in names))  # 5 for the line before a name
+    legend = figure.legend(handles, names, loc="outside lower center", ncols=columns)
     figure.set_figheight(figure.get_figheight() + legend.get_window_extent().height / figure.dpi)
+
+
+def style_of(number: int) -> tuple[str, str, str]:
+    """Colour, marker and line of the 0th, 1st, ... thing in a picture; the first 28 differ."""
+    n = len(COLOURS)
+    return COLOURS[number % n], MARKERS[(number + number // n) % n], LINES[number // n % len(LINES)]
 
 
 def scatter_front(axes: "Axes", points: np.ndarray, name: str, style: int) -> None:
@@ -108,16 +116,16 @@ def scatter_front(axes: "Axes", points: np.ndarray, name: str, style: int) -> No
 
     :param points: (n, n_objectives)
     :param name: in the legend
-    :param style: the number of its colour and marker
+    :param style: its number among those in the picture
     """
-    colour, marker = COLOURS[style % len(COLOURS)], MARKERS[style % len(MARKERS)]
+    colour, marker, line = style_of(style)
     on_front = non_dominated(points)
     axes.scatter(*points[~on_front].T, color=colour, marker=marker, s=14, alpha=0.25)  # type: ignore[misc]
     front = points[on_front]
     axes.scatter(*front.T, color=colour, marker=marker, s=26, label=in_legend(name))  # type: ignore[misc]
     if points.shape[1] == 2:
         front = front[front[:, 0].argsort()]
-        axes.plot(*front.T, color=colour, linewidth=1, alpha=0.6)
+        axes.plot(*front.T, color=colour, linestyle=line, linewidth=1, alpha=0.6)
 
 
 def label_axes(axes: "Axes", objectives: Sequence[str], title: str | None) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sb3_momba.benchmark.chapter4.scores import Aggregate
 from sb3_momba.benchmark.curves import Curve, draw_curve
 from sb3_momba.benchmark.statistics import Estimate
-from sb3_momba.pareto.plotting import COLOURS, MARKERS, default_style, label_axes, save_figure, scatter_front, verbatim
+from sb3_momba.pareto.plotting import COLOURS, default_style, label_axes, save_figure, scatter_front, style_of, verbatim
 
 Array = NDArray[np.float64]
 STYLES = ("-", "--", ":", "-.")
@@ -139,8 +139,8 @@ def draw_scaling(lines: Mapping[str, Sequence[tuple[float, Estimate]]], score: s
         axes = figure.add_subplot()
         for style, (name, points) in enumerate(lines.items()):
             if points:
-                colour = COLOURS[style % len(COLOURS)]
-                axes.plot([x for x, _ in points], [one.value for _, one in points], color=colour, linewidth=1)
+                colour, _, line = style_of(style)
+                axes.plot([x for x, _ in points], [one.value for _, one in points], line, color=colour, linewidth=1)
             for x, one in points:
                 error_bar(axes, x, one.value, one, style, label=name)
         axes.set(xscale="log", xlabel="critic parameters", ylabel=score)
@@ -169,7 +169,7 @@ def draw_normalisation(found: Mapping[str, Aggregate], shapley: Mapping[str, flo
 def error_bar(axes: Axes, x: float, y: float, one: Estimate, style: int, label: str = "", across: bool = False) -> None:
     """:param across: the interval lies along x"""
     lengths = [[max(one.value - one.low, 0)], [max(one.high - one.value, 0)]]
-    colour, marker = COLOURS[style % len(COLOURS)], MARKERS[style % len(MARKERS)]
+    colour, marker, _ = style_of(style)
     bars = {"xerr": lengths} if across else {"yerr": lengths}
     axes.errorbar([x], [y], **bars, color=colour, marker=marker, capsize=3, linestyle="", label=verbatim(label))  # type: ignore[arg-type]
 
