@@ -112,7 +112,7 @@ def prepared(settings: RunSettings, resumed: bool = False) -> Iterator[Prepared]
     """
     if not resumed:  # A record has names in place of classes; the checkpoint has the hyperparameters themselves.
         check_hyperparameters(settings.policy, settings.hyperparameters)
-    for name in ("steps", "eval_freq", "n_preferences", "n_episodes", *RUNNING):
+    for name in ("steps", *RUNNING):
         check_whole(name, getattr(settings, name), 1)
     hyperparameters = hyperparameters_of(settings)
     folder = Path(settings.output)

@@ -862,7 +862,7 @@ def test_fronts_are_drawn_of_two_or_three_objectives(fake, tmp_path, n_objective
     assert len(list((tmp_path / "report").glob("*.png"))) == (2 if n_objectives == 3 else 1)
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::UserWarning")
 def test_names_with_many_settings_are_below_the_axes(fake, tmp_path) -> None:
     curve = {10: box(1.0), 20: FRONT}
     settings = [{f"setting_{i}": i + j for i in range(12)} for j in range(3)]

@@ -1323,7 +1323,7 @@ def test_more_runs_than_colours():
     [[f"run {i} ({', '.join(['cost=$1'] * 12)})" for i in range(4)], [f"run {i}" for i in range(30)]],
     ids=["long", "many"],
 )
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::UserWarning")
 def test_a_large_legend_covers_nothing_and_takes_nothing_from_the_axes(values, names, tmp_path):
     small, large = (
         plot_front({name: values + i for i, name in enumerate(several)}, tmp_path / "front.png") for several in (["a"], names)
