@@ -291,8 +291,7 @@ class PreferenceConditionedAlgorithm(PickleFreeSaving):
         self.replay_buffer.check_memory()
         total_timesteps, root = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self.num_timesteps < total_timesteps <= self.learning_starts:
-            advice = "take more steps, or start earlier."
-            logger.warning("Nothing is learned before learning_starts=%d steps: %s", self.learning_starts, advice)
+            logger.warning("Nothing is learned before learning_starts=%d: lower it, or take more steps.", self.learning_starts)
         self._root_callback = given_callback(root)
         forgive_full_disks(self.logger)
         if self._states_of_callbacks is not None:

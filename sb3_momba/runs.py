@@ -35,7 +35,8 @@ from sb3_momba.settings import check_whole
 from sb3_momba.zoo.configuration import check_hyperparameters, with_defaults, with_schedules
 
 CHECKPOINTS = "checkpoints"
-# No result depends on these: they are no settings of the method, and `config` is without them. A resumption takes over RUNNING.
+# No result depends on these, but for which actions the random floor draws under other eval_envs: they are no settings of the
+# method, and `config` is without them. A resumption takes over RUNNING.
 RUNNING = ("eval_workers", "eval_envs", "checkpoint_freq", "keep_checkpoints")
 NOT_IN_CONFIG = ("output", "progress_bar", *RUNNING)
 

@@ -1,5 +1,6 @@
 """Settings that cannot be: each error names the setting, its value and what it may be."""
 
+import gymnasium as gym
 import pytest
 import torch as th
 
@@ -145,6 +146,8 @@ def test_an_output_inside_a_file_is_one_line(tmp_path):
 def test_an_environment_of_ones_own_is_found_by_its_module():
     with pytest.raises(SystemExit, match="If it is your own, name the module that registers it too: 'my_module:Mine-v0'"):
         main(["--env", "Mine-v0", "--no-progress-bar"])
+    with pytest.raises(gym.error.NameNotFound, match="'my_module:Mine-v0'"):
+        MOMBA("SimbaPolicy", "Mine-v0")
 
 
 @pytest.mark.parametrize("physics", ["physics=2020", "physics=current"])

@@ -26,11 +26,11 @@ def make_env(env: EnvLike, env_kwargs: dict[str, Any] | None = None, render_mode
     :param render_mode: for an id, where its environment takes one
     """
     if isinstance(env, str):
-        if render_mode is not None:
-            with contextlib.suppress(TypeError), warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "(?s).*render_mode", UserWarning)  # It need not have this one.
-                return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
         try:
+            if render_mode is not None:
+                with contextlib.suppress(TypeError), warnings.catch_warnings():
+                    warnings.filterwarnings("ignore", "(?s).*render_mode", UserWarning)  # It need not have this one.
+                    return gym.make(env, disable_env_checker=True, render_mode=render_mode, **(env_kwargs or {}))
             return gym.make(env, disable_env_checker=True, **(env_kwargs or {}))
         except gym.error.UnregisteredEnv as error:
             if ":" in env:

@@ -42,9 +42,15 @@ N_TIMESTEPS = 1_000_000  # where neither file nor command line says
 POLICIES = MOMBA.policy_aliases
 # What belongs to a run, not to a method: how the command line has it.
 OF_A_RUN = {
-    **{"policy": "give --architecture", "env": "give --env", "env_kwargs": "give --env-kwargs", "n_envs": "give --n-envs"},
-    **{"n_timesteps": "give --steps", "seed": "give --seed", "device": "give --device"},
-    **{"tensorboard_log": "a run's folder has its logs", "verbose": "a run's folder has its logs"},
+    "policy": "give --architecture",
+    "env": "give --env",
+    "env_kwargs": "give --env-kwargs",
+    "n_envs": "give --n-envs",
+    "n_timesteps": "give --steps",
+    "seed": "give --seed",
+    "device": "give --device",
+    "tensorboard_log": "a run's folder has its logs",
+    "verbose": "a run's folder has its logs",
 }
 NOT_FOR_CONFIGURATIONS = {*OF_A_RUN, "self", "_init_setup_model", "others"}
 

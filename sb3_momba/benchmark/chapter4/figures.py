@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from sb3_momba.benchmark.chapter4.scores import Aggregate
 from sb3_momba.benchmark.curves import Curve, draw_curve
 from sb3_momba.benchmark.statistics import Estimate
-from sb3_momba.pareto.plotting import COLOURS, default_style, label_axes, save_figure, scatter_front, style_of, verbatim
+from sb3_momba.pareto.plotting import COLOURS, LINES, default_style, label_axes, save_figure, scatter_front, style_of, verbatim
 
 Array = NDArray[np.float64]
-STYLES = ("-", "--", ":", "-.")
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def draw_curves(panels: Sequence[CurvePanel], path: Path) -> bool:
                 if curve is not None:
                     draw_curve(axes, curve, name, style)
             for style, (name, level) in enumerate(panel.levels.items(), start=1):
-                axes.axhline(level, color="grey", linestyle=STYLES[style % len(STYLES)], linewidth=1, label=verbatim(name))
+                axes.axhline(level, color="grey", linestyle=LINES[style % len(LINES)], linewidth=1, label=verbatim(name))
             axes.set(xlabel="environment steps", ylabel=panel.score, title=verbatim(panel.title))
             axes.xaxis.set_major_locator(MaxNLocator(5))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
